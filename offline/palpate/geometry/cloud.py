@@ -1,0 +1,55 @@
+"""The node cloud: where the nodes are, and what volume and surface each one stands for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+INTERIOR = 0
+"""Tag of a node that is not on the boundary."""
+
+
+@dataclass(frozen=True)
+class TriangleSurface:
+    """A triangulated surface.
+
+    vertices  (n_vertices, 3), m
+    triangles (n_triangles, 3), vertex indices, counter-clockwise seen from outside
+    """
+
+    vertices: NDArray[np.float64]
+    triangles: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class NodeCloud:
+    """Nodes that fill a body, surface nodes included.
+
+    points   (n_nodes, 3), m
+    normals  (n_nodes, 3), unit outward normals; zero at interior nodes
+    volumes  (n_nodes,), m³; they sum to the body's volume
+    areas    (n_nodes,), m²; zero at interior nodes, they sum to the body's surface
+    tags     (n_nodes,), 0 inside, k >= 1 on piece k of the boundary (a box: 1..6 for
+             x-, x+, y-, y+, z-, z+; bodies with one smooth boundary: 1)
+    spacing  (n_nodes,), m; local distance between neighbouring nodes, from which the support radius follows
+    surface  the body's boundary, for a view
+    """
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    volumes: NDArray[np.float64]
+    areas: NDArray[np.float64]
+    tags: NDArray[np.int32]
+    spacing: NDArray[np.float64]
+    surface: TriangleSurface
+
+    @property
+    def n_nodes(self) -> int:
+        return len(self.points)
+
+    @property
+    def boundary(self) -> NDArray[np.bool_]:
+        """(n_nodes,), true on the boundary."""
+        return self.tags != INTERIOR

@@ -1,0 +1,105 @@
+"""Linear isotropic viscoelastic material: elastic constants, density and a Prony series."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class PronySeries:
+    """Relaxation of the stress, Eq. 9 of BaniHani & De 2009: gamma_j = E_j / E with time constant tau_j.
+
+    gamma  (n_terms,), dimensionless, > 0
+    tau_s  (n_terms,), s, > 0 and distinct
+    """
+
+    gamma: tuple[float, ...] = ()
+    tau_s: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.gamma) != len(self.tau_s):
+            raise ValueError(
+                f"gamma has {len(self.gamma)} terms and tau_s has {len(self.tau_s)}: expected as many"
+            )
+        for name, values in (("gamma", self.gamma), ("tau_s", self.tau_s)):
+            if not all(np.isfinite(v) and v > 0 for v in values):
+                raise ValueError(f"{name} = {list(values)}: expected finite numbers above 0")
+        if len(set(self.tau_s)) != len(self.tau_s):
+            raise ValueError(
+                f"tau_s = {list(self.tau_s)}: expected distinct time constants (add up equal ones)"
+            )
+
+    @property
+    def instant_factor(self) -> float:
+        """Stiffness at an instant over stiffness at rest, 1 + sum_j gamma_j."""
+        return 1.0 + sum(self.gamma)
+
+    def transfer_factor(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """h(s) = 1 + sum_j gamma_j s tau_j / (1 + s tau_j), the factor from elastic to viscoelastic stress.
+
+        s: any shape, rad/s. Eq. 9 differentiated and Laplace transformed.
+        """
+        h = np.ones_like(s, dtype=np.complex128)
+        for gamma, tau in zip(self.gamma, self.tau_s, strict=True):
+            h += gamma * s * tau / (1 + s * tau)
+        return h
+
+
+@dataclass(frozen=True)
+class Material:
+    """Isotropic linear viscoelastic material, constants at rest (fully relaxed).
+
+    youngs_modulus_pa   E > 0, Pa
+    poissons_ratio      -1 < nu < 0.5
+    density_kg_per_m3   rho > 0, kg/m³
+    """
+
+    youngs_modulus_pa: float
+    poissons_ratio: float
+    density_kg_per_m3: float
+    prony: PronySeries = PronySeries()
+
+    def __post_init__(self) -> None:
+        for name in ("youngs_modulus_pa", "density_kg_per_m3"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} = {value}: expected a finite number above 0")
+        if not -1 < self.poissons_ratio < 0.5:
+            raise ValueError(
+                f"poissons_ratio = {self.poissons_ratio}: expected -1 < nu < 0.5 "
+                "(0.5 itself has no finite bulk modulus; 0.49 is near enough for soft tissue)"
+            )
+
+    @property
+    def shear_modulus_pa(self) -> float:
+        """G = E / (2 (1 + nu)), Pa."""
+        return self.youngs_modulus_pa / (2 * (1 + self.poissons_ratio))
+
+    @property
+    def lame_lambda_pa(self) -> float:
+        """lambda = E nu / ((1 + nu)(1 - 2 nu)), Pa."""
+        nu = self.poissons_ratio
+        return self.youngs_modulus_pa * nu / ((1 + nu) * (1 - 2 * nu))
+
+    def elasticity_matrix(self) -> NDArray[np.float64]:
+        """(6, 6), Pa: C_e of Eq. 10, engineering strain order xx, yy, zz, xy, yz, zx."""
+        lam, mu = self.lame_lambda_pa, self.shear_modulus_pa
+        c = np.zeros((6, 6))
+        c[:3, :3] = lam
+        c[np.arange(3), np.arange(3)] += 2 * mu
+        c[np.arange(3, 6), np.arange(3, 6)] = mu
+        return c
+
+
+PRESETS: dict[str, Material] = {
+    # BaniHani & De 2009, section 4.2: rho = 10, gamma_1 = 1, tau_1 = 1 s. E and nu are not stated there: 1 and 0.3 are ours.
+    "paper-cube": Material(1.0, 0.3, 10.0, PronySeries((1.0,), (1.0,))),
+    # Liver: G = 1.8 +- 0.4 kPa and rho = 1060 kg/m3, PMC6925591 Table 1, so E = 3 G = 5.4 kPa as for nu = 0.5.
+    # gamma 0.5 and tau 0.58 s as in the viscoelastic TLED example of the SOFA framework.
+    # The second branch (0.3 at 4 ms) stands for the short-time branches of real tissue: without one a mode above
+    # 1/tau keeps ringing, decaying at only gamma / (2 (1 + gamma) tau). It is our choice, not a measurement.
+    "liver": Material(5400.0, 0.45, 1060.0, PronySeries((0.5, 0.3), (0.58, 0.004))),
+}

@@ -1,0 +1,48 @@
+"""The elastic modes of a supported body seen from its contact patches: what a discretisation hands to the reduction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class ElasticModes:
+    """Modes of the body, held at its supports and contact patches, and their coupling to the patches.
+
+    With patch displacements u (n_inputs,), modal coordinates q (n_modes,) and the Prony factor h(s):
+
+        s² q + h(s) diag(squared_frequencies) q = -h(s) input_coupling u
+        force = h(s) (direct_stiffness u + output_coupling q)
+        nodal displacement = shapes q + patch_shapes u
+
+    so force(s) = h(s) [K_tt - sum_k c_k b_k^T h(s) / (s² + mu_k h(s))] u(s). The patch's own inertia is dropped.
+
+    squared_frequencies  (n_modes,), (rad/s)²; real and ascending for `conservative`, else complex
+    input_coupling       (n_modes, n_inputs), b_k, mass-normalised
+    output_coupling      (n_outputs, n_modes), c_k; the transpose of input_coupling for `conservative`
+    direct_stiffness     (n_outputs, n_inputs), K_tt, N/m at rest
+    shapes               (3 n_nodes, n_modes), x, y, z of node 0, then of node 1, ...; m per unit q
+    patch_shapes         (3 n_nodes, n_inputs), m per m: identity on the patch, zero elsewhere
+
+    Inputs and outputs run over the contact patches in order, x, y, z each.
+    """
+
+    squared_frequencies: NDArray[np.float64] | NDArray[np.complex128]
+    input_coupling: NDArray[np.float64] | NDArray[np.complex128]
+    output_coupling: NDArray[np.float64] | NDArray[np.complex128]
+    direct_stiffness: NDArray[np.float64]
+    shapes: NDArray[np.float64] | NDArray[np.complex128]
+    patch_shapes: NDArray[np.float64]
+
+    @property
+    def n_modes(self) -> int:
+        return len(self.squared_frequencies)
+
+    @property
+    def static_stiffness(self) -> NDArray[np.float64]:
+        """(n_outputs, n_inputs), N/m: what a hand feels when it stays, K_tt - sum_k c_k b_k^T / mu_k."""
+        scaled = self.input_coupling / self.squared_frequencies[:, None]
+        return np.real(self.direct_stiffness - self.output_coupling @ scaled)

@@ -1,0 +1,1 @@
+"""Run a reduced tissue model at 1 kHz: displacements in, reaction forces out, over Zenoh."""
