@@ -1,0 +1,1 @@
+"""Scenes that ship with palpate: geometry, material, contacts and reduction, one TOML file each."""
