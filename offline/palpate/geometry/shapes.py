@@ -1,0 +1,188 @@
+"""Node clouds of simple bodies: a box on a lattice, and a ball."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from palpate.geometry.cloud import INTERIOR, NodeCloud, TriangleSurface
+from palpate.geometry.tributary import tributary_measures
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+_SAMPLES_A_SPACING = 8
+"""Fine samples along one node spacing where volumes and areas come from the nearest node."""
+
+
+def box_lattice(
+    lower: Vector, upper: Vector, counts: tuple[int, int, int], jitter: float = 0.0, seed: int = 0
+) -> NodeCloud:
+    """Lattice of counts[0] x counts[1] x counts[2] nodes from face to face of a box.
+
+    lower, upper  opposite corners, m
+    counts        nodes along x, y, z, at least 2 each; 9 of them in 1 m are 1/8 m apart
+    jitter        largest displacement of a node along each axis as a fraction of the spacing, 0 <= jitter < 0.5.
+                  Nodes of a face stay in it, nodes of an edge on it, corners where they are.
+    seed          of the jitter
+
+    Volumes and areas are the trapezoid rule's; with jitter, the parts of the box and of each face that are
+    nearest to the node, measured with 8 samples a spacing. Either way they sum to the box's volume and surface.
+    An edge or corner node has the mean of its faces' normals, weighted with the area it holds of each, and the
+    tag of its first face in the order x-, x+, y-, y+, z-, z+. `spacing` is the largest of the three axes'.
+
+    Raises ValueError when an argument is out of its range.
+    """
+    low, high, n = np.asarray(lower, float), np.asarray(upper, float), np.asarray(counts)
+    _check_box(low, high)
+    if n.shape != (3,) or np.any(n < 2):
+        raise ValueError(f"counts = {counts}: expected three numbers, each at least 2")
+    if not 0 <= jitter < 0.5:
+        raise ValueError(f"jitter = {jitter}: expected 0 <= jitter < 0.5 spacings")
+
+    step = (high - low) / (n - 1)
+    index = _lattice_index(n)
+    points = np.where(index == n - 1, high, low + index * step)
+    on_lower, on_upper = index == 0, index == n - 1
+    faces = np.stack([on_lower, on_upper], axis=2).reshape(-1, 6)  # (n_nodes, 6), x-, x+, y-, ...
+    if jitter:
+        shift = np.random.default_rng(seed).uniform(-jitter, jitter, points.shape) * step
+        points = points + np.where(on_lower | on_upper, 0.0, shift)
+        volumes = tributary_measures(points, *_midpoints(low, high, _SAMPLES_A_SPACING * (n - 1)))
+    else:
+        volumes = np.prod(np.where(on_lower | on_upper, 0.5, 1.0) * step, axis=1)
+
+    face_areas = np.zeros((len(points), 6))
+    for face in range(6):
+        members = faces[:, face]
+        axis = face // 2
+        if jitter:
+            flat_low, flat_high, cells = low.copy(), high.copy(), _SAMPLES_A_SPACING * (n - 1)
+            flat_low[axis] = flat_high[axis] = (low, high)[face % 2][axis]
+            cells[axis] = 1
+            face_areas[members, face] = tributary_measures(
+                points[members], *_midpoints(flat_low, flat_high, cells)
+            )
+        else:
+            weights = np.where(on_lower | on_upper, 0.5, 1.0) * step
+            face_areas[members, face] = np.prod(np.delete(weights[members], axis, axis=1), axis=1)
+
+    outward = np.repeat(np.eye(3), 2, axis=0) * np.tile([-1.0, 1.0], 3)[:, None]  # (6, 3)
+    normals = face_areas @ outward
+    boundary = faces.any(axis=1)
+    normals[boundary] /= np.linalg.norm(normals[boundary], axis=1, keepdims=True)
+    tags = np.where(boundary, 1 + np.argmax(faces, axis=1), INTERIOR).astype(np.int32)
+    return NodeCloud(
+        points=points,
+        normals=normals,
+        volumes=volumes,
+        areas=face_areas.sum(axis=1),
+        tags=tags,
+        spacing=np.full(len(points), step.max()),
+        surface=_lattice_surface(points, n),
+    )
+
+
+def box_surface(lower: Vector, upper: Vector) -> TriangleSurface:
+    """The 12 triangles of a box between opposite corners, m. Raises ValueError when lower is not below upper."""
+    low, high = np.asarray(lower, float), np.asarray(upper, float)
+    _check_box(low, high)
+    n = np.array([2, 2, 2])
+    corners = _lattice_index(n)
+    return _lattice_surface(np.where(corners == 1, high, low), n)
+
+
+def ball(radius_m: float, spacing_m: float) -> NodeCloud:
+    """Ball around the origin: a cubic lattice inside, spiral points on the surface.
+
+    The surface nodes lie on a Fibonacci spiral, one for every spacing², and the lattice ends 0.6 spacings below
+    them. Volumes and areas are those of the points of the ball and of the sphere nearest to the node, from
+    samples 1/8 spacing apart; they sum to 4/3 pi radius³ and 4 pi radius².
+
+    Raises ValueError when the spacing is not between 0 and half the radius.
+    """
+    if not (np.isfinite(radius_m) and radius_m > 0):
+        raise ValueError(f"radius_m = {radius_m}: expected a length above 0")
+    if not 0 < spacing_m <= radius_m / 2:
+        raise ValueError(f"spacing_m = {spacing_m}: expected above 0 and at most half the radius {radius_m}")
+    area, volume = 4 * np.pi * radius_m**2, 4 / 3 * np.pi * radius_m**3
+    directions = _spiral(round(area / spacing_m**2))
+    interior = _grid_in_ball(radius_m - 0.6 * spacing_m, spacing_m, offset=0.0)
+    points = np.vstack([interior, radius_m * directions])
+    on_surface = np.arange(len(points)) >= len(interior)
+
+    fine = spacing_m / _SAMPLES_A_SPACING
+    samples = _grid_in_ball(radius_m, fine, offset=0.5)
+    skin = radius_m * _spiral(round(area / fine**2))
+    areas = np.zeros(len(points))
+    areas[on_surface] = tributary_measures(points[on_surface], skin, np.ones(len(skin)), area)
+    normals = np.zeros_like(points)
+    normals[on_surface] = directions
+    hull = ConvexHull(directions).simplices
+    corners = directions[hull]
+    inward = np.einsum("ti,ti->t", np.cross(corners[:, 0], corners[:, 1]), corners[:, 2]) < 0
+    hull[inward] = hull[inward][:, ::-1]
+    return NodeCloud(
+        points=points,
+        normals=normals,
+        volumes=tributary_measures(points, samples, np.ones(len(samples)), volume),
+        areas=areas,
+        tags=np.where(on_surface, 1, INTERIOR).astype(np.int32),
+        spacing=np.full(len(points), spacing_m),
+        surface=TriangleSurface(vertices=radius_m * directions, triangles=hull.astype(np.int32)),
+    )
+
+
+def _check_box(low: Array, high: Array) -> None:
+    if low.shape != (3,) or high.shape != (3,) or not np.all(np.isfinite([low, high])) or np.any(low >= high):
+        raise ValueError(
+            f"lower = {low.tolist()}, upper = {high.tolist()}: expected finite corners with lower < upper"
+        )
+
+
+def _lattice_index(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(prod(counts), 3), the integer places of a lattice, the last one running fastest."""
+    return np.indices(tuple(int(n) for n in counts)).reshape(3, -1).T
+
+
+def _midpoints(low: Array, high: Array, cells: NDArray[np.int64]) -> tuple[Array, Array, float]:
+    """Midpoints of a grid of cells, their equal weights, and the measure of the whole (of a face if one is flat)."""
+    extent = high - low
+    total = float(np.prod(extent[extent > 0]))
+    points = low + (_lattice_index(cells) + 0.5) * (extent / cells)
+    return points, np.full(len(points), total / len(points)), total
+
+
+def _spiral(count: int) -> Array:
+    """(count, 3), nearly evenly spread unit vectors on the Fibonacci (golden-angle) spiral."""
+    i = np.arange(count)
+    z = 1 - (2 * i + 1) / count
+    angle = np.pi * (3 - np.sqrt(5)) * i
+    rho = np.sqrt(1 - z**2)
+    return np.column_stack([rho * np.cos(angle), rho * np.sin(angle), z])
+
+
+def _grid_in_ball(radius: float, step: float, offset: float) -> Array:
+    """(n, 3), points (i + offset) step within the radius; offset 0 has a point at the centre."""
+    reach = int(np.ceil(radius / step)) + 1
+    axis = (np.arange(-reach, reach + 1) + offset) * step
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    return points[np.einsum("ij,ij->i", points, points) <= radius**2]
+
+
+def _lattice_surface(points: Array, n: NDArray[np.int64]) -> TriangleSurface:
+    """Two triangles for every cell of the six faces of a lattice of nodes; its vertices are the boundary nodes."""
+    index = np.arange(len(points)).reshape(n)
+    triangles = []
+    for axis in range(3):
+        for side in (0, -1):
+            layer = np.take(index, side, axis=axis)
+            a, b, c, d = layer[:-1, :-1], layer[1:, :-1], layer[1:, 1:], layer[:-1, 1:]
+            quads = np.stack([a, b, c, d], axis=-1).reshape(-1, 4)
+            # The two axes left over, in order, turn about +x and +z, but about -y.
+            if (side == 0) != (axis == 1):
+                quads = quads[:, ::-1]
+            triangles += [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
+    used, renumbered = np.unique(np.vstack(triangles), return_inverse=True)
+    return TriangleSurface(vertices=points[used], triangles=renumbered.reshape(-1, 3).astype(np.int32))
