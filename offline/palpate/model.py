@@ -6,8 +6,6 @@ import io
 import json
 import os
 import tempfile
-import zipfile
-import zlib
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -241,12 +239,15 @@ def load_model(path: Path) -> ReducedModel:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such model file")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ModelFileError(f"{path}: a single array, expected an .npz archive")
+        with archive:
             arrays = {key: archive[key] for key in archive.files}
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError) as error:
+    except ModelFileError:
+        raise
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds on damaged bytes
         raise ModelFileError(f"{path}: damaged or not an .npz archive ({error})") from error
-    except AttributeError as error:  # a bare .npy file loads as an array without keys
-        raise ModelFileError(f"{path}: a single array, expected an .npz archive") from error
     try:
         return _assemble(arrays)
     except ModelFileError as error:
