@@ -1,0 +1,129 @@
+"""Shape functions with all first and second derivatives: the compiled kernel against the same algebra in batched numpy.
+
+    python benchmarks/shape_functions.py [--points 10000] [--order 2]
+
+Both get the same neighbour lists, so that only the evaluation is compared; the ratio of points per second is printed,
+and the largest relative difference of the results, which shows that both compute the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.meshfree.kernel import evaluate
+from palpate.meshfree.neighbours import covering_nodes
+
+Array = NDArray[np.float64]
+SECOND = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
+
+
+def compiled(
+    points: Array, x: Array, radii: Array, indptr: NDArray[np.int32], indices: NDArray[np.int32], order: int
+) -> Array:
+    """(10, nnz): value, three first and six second derivatives."""
+    out = np.empty((10, len(indices)))
+    evaluate(points, x, radii, indptr, indices, order, 2, out[0], out[1:4], out[4:], np.empty(len(points)))
+    return out
+
+
+def batched_numpy(
+    points: Array, x: Array, radii: Array, indptr: NDArray[np.int32], indices: NDArray[np.int32], order: int
+) -> Array:
+    """The same from padded arrays, einsum and batched solves, in batches of 1,000 points."""
+    out = np.empty((10, len(indices)))
+    counts = np.diff(indptr)
+    for begin in range(0, len(points), 1000):
+        rows = np.arange(begin, min(begin + 1000, len(points)))
+        k = np.arange(counts[rows].max())
+        mask = k < counts[rows][:, None]
+        entry = np.where(mask, indptr[rows][:, None] + k, 0)
+        node = indices[entry]
+        scale = np.where(mask, radii[node], 0).max(axis=1)[:, None]
+        y = (x[node] - points[rows][:, None]) / scale[..., None]
+        ratio = scale / radii[node]
+        s = np.linalg.norm(y, axis=-1) * ratio
+        t = np.where(mask, np.maximum(1 - s, 0), 0)
+        slope = -12 * t**2 * ratio**2
+        curvature = np.divide(24 * t * ratio**4, s, out=np.zeros_like(s), where=s > 0)
+        w = t**3 * (1 + 3 * s)
+        w1 = -slope[..., None] * y
+        w2 = np.stack([curvature * y[..., a] * y[..., b] + (slope if a == b else 0) for a, b in SECOND], -1)
+        p = np.concatenate([np.ones_like(s)[..., None], y], -1)
+        if order == 2:
+            p = np.concatenate([p, np.stack([y[..., a] * y[..., b] for a, b in SECOND], -1)], -1)
+        moment = np.einsum("nk,nki,nkj->nij", w, p, p)
+        size = p.shape[-1]
+        right = np.zeros((len(rows), size, 1))
+        right[:, 0] = 1
+        g = p @ np.linalg.solve(moment, right)
+        right = np.zeros((len(rows), size, 3))
+        right[:, 1:4] = np.eye(3)
+        known1 = w1 * g
+        g1 = p @ np.linalg.solve(moment, right - np.swapaxes(p, 1, 2) @ known1)
+        right = np.zeros((len(rows), size, 6))
+        if order == 2:
+            right[:, 4:] = np.diag([2, 2, 2, 1, 1, 1])
+        cross = [w1[..., a] * g1[..., b] + w1[..., b] * g1[..., a] for a, b in SECOND]
+        known2 = w2 * g + np.stack(cross, -1)
+        g2 = p @ np.linalg.solve(moment, right - np.swapaxes(p, 1, 2) @ known2)
+        h = np.concatenate(
+            [
+                w[..., None] * g,
+                (known1 + w[..., None] * g1) / scale[..., None],
+                (known2 + w[..., None] * g2) / scale[..., None] ** 2,
+            ],
+            -1,
+        )
+        out[:, entry[mask]] = h[mask].T
+    return out
+
+
+def seconds(function: Callable[[], Array], repeats: int) -> tuple[float, Array]:
+    """Best time of the repeats, after one run that compiles and warms up."""
+    result = function()
+    best = np.inf
+    for _ in range(repeats):
+        start = time.perf_counter()
+        result = function()
+        best = min(best, time.perf_counter() - start)
+    return best, result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--points", type=int, default=10_000)
+    parser.add_argument("--order", type=int, choices=(1, 2), default=2)
+    arguments = parser.parse_args()
+
+    n = round(arguments.points ** (1 / 3)) + 4
+    h = 1 / (n - 1)
+    lattice = np.stack(np.meshgrid(*[np.linspace(0, 1, n)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    x = lattice + np.random.default_rng(0).uniform(-0.2, 0.2, lattice.shape) * h
+    radii = np.full(len(x), 2.02 * h)
+    points = x[
+        np.all((lattice > 1.5 * h) & (lattice < 1 - 1.5 * h), axis=1)
+    ]  # full supports, as in a large body
+    start = time.perf_counter()
+    indptr, indices = covering_nodes(points, x, radii)
+    search = time.perf_counter() - start
+    ours, a = seconds(lambda: compiled(points, x, radii, indptr, indices, arguments.order), 5)
+    peer, b = seconds(lambda: batched_numpy(points, x, radii, indptr, indices, arguments.order), 1)
+    difference = max(np.abs(u - v).max() / np.abs(v).max() for u, v in zip(a, b, strict=True))
+    print(
+        f"{len(points)} points, order {arguments.order}, {len(indices) / len(points):.1f} neighbours, value + 3 + 6 derivatives"
+    )
+    print(f"neighbour search (scipy cKDTree)  {len(points) / search:12,.0f} points/s")
+    print(f"compiled kernel                   {len(points) / ours:12,.0f} points/s")
+    print(f"batched numpy                     {len(points) / peer:12,.0f} points/s")
+    print(f"ratio {peer / ours:.0f}, largest relative difference {difference:.1e}")
+
+
+if __name__ == "__main__":
+    main()
