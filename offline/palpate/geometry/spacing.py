@@ -1,0 +1,55 @@
+"""How far apart nodes are to lie, as a function of place: coarse, and finer around chosen points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """A ball within which nodes lie closer together.
+
+    center_m   its centre, m
+    radius_m   > 0, m
+    spacing_m  > 0, distance of the nodes within, m
+    growth     0 < growth <= 0.5, by how much the distance grows for every metre away from the ball
+    rings      put the surface nodes of the ball on circles around the surface point nearest to the centre: one
+               node there, rings about one spacing apart, one of them exactly `radius_m` from it, and the next
+               one a spacing further out. A round tip of that radius then has the same outline at every spacing.
+    """
+
+    center_m: tuple[float, float, float]
+    radius_m: float
+    spacing_m: float
+    growth: float = 0.3
+    rings: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.center_m) != 3 or not np.all(np.isfinite(self.center_m)):
+            raise ValueError(f"center_m = {self.center_m}: expected three finite numbers")
+        for name, value in (("radius_m", self.radius_m), ("spacing_m", self.spacing_m)):
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} = {value}: expected a length above 0")
+        if not 0 < self.growth <= 0.5:
+            raise ValueError(f"growth = {self.growth}: expected 0 < growth <= 0.5")
+
+
+@dataclass(frozen=True)
+class SpacingField:
+    """h(x) = min(spacing_m, refinement.spacing_m + growth * distance outside the refined ball)."""
+
+    spacing_m: float
+    refinements: tuple[Refinement, ...] = ()
+
+    def __call__(self, points: Array) -> Array:
+        """Spacing in m at points (n, 3) in m, (n,)."""
+        h = np.full(len(points), self.spacing_m)
+        for r in self.refinements:
+            outside = np.maximum(0.0, np.linalg.norm(points - np.asarray(r.center_m), axis=1) - r.radius_m)
+            h = np.minimum(h, r.spacing_m + r.growth * outside)
+        return h
