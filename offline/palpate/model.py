@@ -79,6 +79,22 @@ class StateSpace:
 
 
 @dataclass(frozen=True)
+class PoleResidueSystem:
+    """The full model, kept beside the reduced one so that anyone can check what the server answers:
+
+        F(s) = D + sum_i c_i b_i^T / (s - p_i), each pole above the real axis standing for its conjugate too.
+
+    poles (n_poles,), imaginary part >= 0, 1/s
+    b (n_poles, n_inputs), c (n_outputs, n_poles), complex; d (n_outputs, n_inputs), N/m
+    """
+
+    poles: NDArray[np.complex128]
+    b: NDArray[np.complex128]
+    c: NDArray[np.complex128]
+    d: Array
+
+
+@dataclass(frozen=True)
 class Surface:
     """The body's surface and how it moves with the reduced model's state.
 
@@ -137,8 +153,10 @@ class ReducedModel:
     continuous  the reduced model dx/dt = A x + B u, F = C x + D u (u displacement in m, F force in N)
     discrete    its first-order-hold discretisation at period_s in the form that runs:
                 F = C xi + D u, then xi+ = A xi + B u with the newest sample u
+    full        the model that was reduced; nothing at run time needs it
     static_stiffness (n_outputs, n_inputs), N/m, of the full model; instant stiffness is continuous.d
-    config      text of the configuration (TOML) it was built from; config_sha256 is its hash
+    config      the configuration it was built from, defaults filled in, as JSON; config_sha256 is the hash of that
+                and of the surface file
     """
 
     name: str
@@ -149,6 +167,7 @@ class ReducedModel:
     contacts: tuple[Contact, ...]
     continuous: StateSpace
     discrete: StateSpace
+    full: PoleResidueSystem
     static_stiffness: Array
     surface: Surface
     evidence: Evidence
@@ -211,7 +230,7 @@ def save_model(model: ReducedModel, path: Path) -> None:
         "static_stiffness": model.static_stiffness,
         "hankel_singular_values": model.evidence.hankel_singular_values,
     }
-    for group in ("continuous", "discrete", "surface"):
+    for group in ("continuous", "discrete", "full", "surface"):
         part = getattr(model, group)
         arrays |= {f"{group}_{f.name}": getattr(part, f.name) for f in fields(part)}
     buffer = io.BytesIO()
@@ -279,6 +298,7 @@ def _assemble(arrays: dict[str, NDArray[Any]]) -> ReducedModel:
             )
         n_vertices = _count(arrays, "surface_vertices")
         n_triangles = _count(arrays, "surface_triangles")
+        n_poles = _count(arrays, "full_poles")
         evidence_fields = dict(scalars["evidence"])
         evidence_fields["band_hz"] = tuple(evidence_fields["band_hz"])
         model = ReducedModel(
@@ -290,6 +310,12 @@ def _assemble(arrays: dict[str, NDArray[Any]]) -> ReducedModel:
             contacts=contacts,
             continuous=_state_space(arrays, "continuous", order, channels),
             discrete=_state_space(arrays, "discrete", order, channels),
+            full=PoleResidueSystem(
+                poles=_take(arrays, "full_poles", (n_poles,), np.complex128),
+                b=_take(arrays, "full_b", (n_poles, channels), np.complex128),
+                c=_take(arrays, "full_c", (channels, n_poles), np.complex128),
+                d=_take(arrays, "full_d", (channels, channels), np.float64),
+            ),
             static_stiffness=_take(arrays, "static_stiffness", (channels, channels), np.float64),
             surface=Surface(
                 vertices=_take(arrays, "surface_vertices", (n_vertices, 3), np.float64),

@@ -15,6 +15,7 @@ from palpate.model import (
     Contact,
     Evidence,
     ModelFileError,
+    PoleResidueSystem,
     ReducedModel,
     StateSpace,
     Surface,
@@ -40,6 +41,12 @@ def small_model() -> ReducedModel:
         contacts=(Contact("tip", (0.1, 0.2, 0.3), (0.0, 0.0, 1.0), 0.005, 9),),
         continuous=continuous,
         discrete=discrete,
+        full=PoleResidueSystem(
+            poles=np.array([-2.0 + 0j, -1.0 + 30j]),
+            b=rng.normal(size=(2, channels)) + 0j,
+            c=rng.normal(size=(channels, 2)) + 0j,
+            d=np.eye(channels),
+        ),
         static_stiffness=80 * np.eye(channels),
         surface=Surface(
             vertices=rng.normal(size=(vertices, 3)),
