@@ -2,71 +2,76 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.geometry.cloud import INTERIOR, NodeCloud, TriangleSurface
-from palpate.geometry.sampling import (
-    InsideSamples,
-    SurfaceSamples,
-    closest_on_surface,
-    enclosed_volume,
-    sample_inside,
-    sample_surface,
-    triangle_normals,
-)
+from palpate.geometry.sampling import Samples, closest_point, sample_elements, sample_inside
+from palpate.geometry.sharp_edges import sharp_edges
 from palpate.geometry.spacing import Refinement, SpacingField
-from palpate.geometry.tributary import tributary_measures
+from palpate.geometry.surface import check_surface, enclosed_volume, triangle_normals
+from palpate.geometry.tributary import nearest_node, tributary_measures
 
 Array = NDArray[np.float64]
 
-_FINENESS = 0.25
-_SURFACE_DISC, _INTERIOR_DISC = 0.81, 0.86
+MAX_NODES = 200_000
+"""More than this is taken for a slip of units."""
+
+_PLACING, _MEASURING = 1 / 4, 1 / 8
+"""Distance of samples over that of nodes, where nodes are placed and where their shares are measured."""
+
+_DISC = {1: 0.75, 2: 0.81, 3: 0.86}
+"""Distance over spacing at which points dropped at random until none fits have 1 node per spacing^dimension."""
+
 _RELAXATIONS = 12
 
 
 def fill_surface(
-    surface: TriangleSurface, spacing_m: float, refinements: tuple[Refinement, ...] = (), seed: int = 0
+    surface: TriangleSurface, spacing_m: float, refinements: Sequence[Refinement] = (), seed: int = 0
 ) -> NodeCloud:
-    """Fill the inside of a closed, outward oriented surface; its boundary nodes lie on it and come first.
+    """Fill the inside of a closed surface; the boundary nodes lie on it and come first.
 
-    spacing_m    distance between nodes far from the refinements, m
+    spacing_m    distance between nodes away from the refinements, m
     refinements  balls with nodes closer together
     seed         of the random order in which nodes are placed; the same seed gives the same cloud
+
+    Nodes are placed on round patches, corners, sharp edges, faces and inside, in this order. Each time they are
+    dropped at random on a fine sampling, none closer to another than allowed (Poisson discs), then moved to the
+    centroids of the samples nearest to them, weighted so that the local spacing comes out as asked (Lloyd's
+    iteration for a centroidal Voronoi tessellation with density h^-(dimension + 2), Du et al. 1999).
+
+    Volumes and areas are what is nearest to the node, in samples 1/8 spacing apart, and sum to the body's; normals
+    are the mean over that area. All boundary nodes have tag 1.
+
+    Raises SurfaceError when the surface bounds no body, ValueError when the spacing doesn't suit the body or a
+    round patch finds no place on it.
     """
+    check_surface(surface)
+    refinements = tuple(refinements)
+    _check_spacing(surface, spacing_m, refinements)
     rng = np.random.default_rng(seed)
     field = SpacingField(spacing_m, refinements)
-    skin = sample_surface(surface, field, _FINENESS)
-    inside = sample_inside(surface, field, _FINENESS)
-    fixed = np.vstack([np.empty((0, 3))] + [_rings(surface, r) for r in refinements if r.rings])
-    free = _spread(skin.points, _SURFACE_DISC * skin.spacing, fixed, _SURFACE_DISC * field(fixed), rng)
-    boundary = _relax_on_surface(fixed, free, skin, surface)
-    deep = inside.depths > 0.5 * inside.spacing
-    interior = _spread(
-        inside.points[deep],
-        _INTERIOR_DISC * inside.spacing[deep],
-        boundary,
-        _INTERIOR_DISC * field(boundary),
-        rng,
-    )
-    interior = _relax_inside(boundary, interior, inside)
+    boundary = _boundary_nodes(surface, field, rng)
 
-    points = np.vstack([boundary, interior])
+    samples, depth = sample_inside(surface, field, _PLACING)
+    room = depth > 0.5 * samples.spacing
+    points = _place(boundary, samples, room, 3, lambda p: p, field, rng)
     n_boundary = len(boundary)
-    normals, _ = triangle_normals(surface)
-    areas, node_normals = np.zeros(len(points)), np.zeros_like(points)
-    _, owner = cKDTree(boundary).query(skin.points, workers=-1)
-    areas[:n_boundary] = np.bincount(owner, skin.areas, minlength=n_boundary)
-    vectors = normals[skin.triangles] * skin.areas[:, None]
-    for axis in range(3):
-        node_normals[:n_boundary, axis] = np.bincount(owner, vectors[:, axis], minlength=n_boundary)
-    node_normals[:n_boundary] /= np.linalg.norm(node_normals[:n_boundary], axis=1, keepdims=True)
-    volumes = tributary_measures(points, inside.points, inside.volumes, enclosed_volume(surface))
+    if len(points) == n_boundary:
+        raise ValueError(
+            f"spacing_m = {spacing_m}: no node found room inside the body, expected a smaller spacing"
+        )
+
+    areas, normals = np.zeros(len(points)), np.zeros_like(points)
+    areas[:n_boundary], normals[:n_boundary] = _areas_and_normals(boundary, surface, field)
+    samples, _ = sample_inside(surface, field, _MEASURING)
     return NodeCloud(
         points=points,
-        normals=node_normals,
-        volumes=volumes,
+        normals=normals,
+        volumes=tributary_measures(points, samples.points, samples.measures, enclosed_volume(surface)),
         areas=areas,
         tags=np.where(np.arange(len(points)) < n_boundary, 1, INTERIOR).astype(np.int32),
         spacing=field(points),
@@ -74,65 +79,143 @@ def fill_surface(
     )
 
 
-def _spread(
-    candidates: Array, radii: Array, fixed: Array, fixed_radii: Array, rng: np.random.Generator
+def _check_spacing(surface: TriangleSurface, spacing_m: float, refinements: tuple[Refinement, ...]) -> None:
+    if not (np.isfinite(spacing_m) and spacing_m > 0):
+        raise ValueError(f"spacing_m = {spacing_m}: expected a length above 0")
+    extent = np.ptp(surface.vertices, axis=0)
+    if spacing_m > extent.max() / 4:
+        raise ValueError(
+            f"spacing_m = {spacing_m}: expected at most a quarter of the body's largest extent, "
+            f"{' x '.join(f'{e:.3g}' for e in extent)} m"
+        )
+    volume = enclosed_volume(surface)
+    fine = sum(min(volume, 4 / 3 * np.pi * r.radius_m**3) / r.spacing_m**3 for r in refinements)
+    estimate = volume / spacing_m**3 + fine
+    if estimate > MAX_NODES:
+        raise ValueError(
+            f"spacing_m = {spacing_m} would give some {estimate:.2g} nodes in a body of "
+            f"{' x '.join(f'{e:.3g}' for e in extent)} m, expected at most {MAX_NODES}"
+        )
+
+
+def _boundary_nodes(surface: TriangleSurface, field: SpacingField, rng: np.random.Generator) -> Array:
+    """(n_boundary, 3): patch rings, then corners, sharp edges and faces of the surface, m."""
+    vertices, triangles = surface.vertices, surface.triangles.astype(np.int64)
+    nodes = _patches(surface, field)
+    edges, corners = sharp_edges(surface)
+    nodes = np.vstack([nodes, _spread(vertices[corners], nodes, 1, field, rng)])
+    if len(edges):
+        samples, _ = sample_elements(vertices, edges, field, _PLACING / 2)
+        nodes = _place(nodes, samples, None, 1, lambda p: closest_point(p, vertices, edges)[0], field, rng)
+    samples, _ = sample_elements(vertices, triangles, field, _PLACING)
+    return _place(nodes, samples, None, 2, lambda p: closest_point(p, vertices, triangles)[0], field, rng)
+
+
+def _place(
+    fixed: Array,
+    samples: Samples,
+    room: NDArray[np.bool_] | None,
+    dimension: int,
+    project: Callable[[Array], Array],
+    field: SpacingField,
+    rng: np.random.Generator,
 ) -> Array:
-    """Candidates in random order, each taken unless one taken before (or a fixed node) lies within its radius."""
-    tree = cKDTree(candidates)
+    """The fixed nodes and, after them, new ones spread among the samples (those with room, if given) and relaxed."""
+    candidates = samples.points if room is None else samples.points[room]
+    free = _spread(candidates, fixed, dimension, field, rng)
+    weights = samples.measures / samples.spacing ** (dimension + 2)
+    for _ in range(_RELAXATIONS):
+        nodes = np.vstack([fixed, free])
+        owner = nearest_node(nodes, samples.points)
+        mass = np.bincount(owner, weights, minlength=len(nodes))[len(fixed) :]
+        moment = np.column_stack(
+            [np.bincount(owner, weights * x, minlength=len(nodes))[len(fixed) :] for x in samples.points.T]
+        )
+        free = project(np.where(mass[:, None] > 0, moment / np.where(mass > 0, mass, 1.0)[:, None], free))
+    return np.vstack([fixed, free])
+
+
+def _spread(
+    candidates: Array, fixed: Array, dimension: int, field: SpacingField, rng: np.random.Generator
+) -> Array:
+    """The candidates in random order, less those within the disc of a fixed node or of one taken before, (n, 3)."""
+    tree = cKDTree(candidates) if len(candidates) else None
     alive = np.ones(len(candidates), dtype=bool)
-    for near in tree.query_ball_point(fixed, fixed_radii) if len(fixed) else []:
-        alive[near] = False
+    if tree is not None and len(fixed):
+        for near in tree.query_ball_point(fixed, _DISC[dimension] * field(fixed)):
+            alive[near] = False
+    radii = _DISC[dimension] * field(candidates)
     taken = []
     for i in rng.permutation(len(candidates)):
-        if alive[i]:
+        if alive[i] and tree is not None:
             taken.append(i)
             alive[tree.query_ball_point(candidates[i], radii[i])] = False
     return candidates[taken]
 
 
-def _relax_on_surface(fixed: Array, free: Array, skin: SurfaceSamples, surface: TriangleSurface) -> Array:
-    weights = skin.areas / skin.spacing**4
-    for _ in range(_RELAXATIONS):
-        free = _centroids(np.vstack([fixed, free]), skin.points, weights)[len(fixed) :]
-        free, _ = closest_on_surface(free, surface)
-    return np.vstack([fixed, free])
-
-
-def _relax_inside(boundary: Array, interior: Array, inside: InsideSamples) -> Array:
-    weights = inside.volumes / inside.spacing**5
-    for _ in range(_RELAXATIONS):
-        interior = _centroids(np.vstack([boundary, interior]), inside.points, weights)[len(boundary) :]
-    return interior
-
-
-def _centroids(nodes: Array, samples: Array, weights: Array) -> Array:
-    """Weighted centroid of the samples nearest to each node, (n_nodes, 3); the node itself where there are none."""
-    _, owner = cKDTree(nodes).query(samples, workers=-1)
-    mass = np.bincount(owner, weights, minlength=len(nodes))
-    moment = np.column_stack(
-        [np.bincount(owner, weights * samples[:, axis], minlength=len(nodes)) for axis in range(3)]
-    )
-    return np.where(mass[:, None] > 0, moment / np.where(mass > 0, mass, 1.0)[:, None], nodes)
+def _patches(surface: TriangleSurface, field: SpacingField) -> Array:
+    """(n, 3), nodes of the refinements with rings, m."""
+    patches = [_rings(surface, r) for r in field.refinements if r.rings]
+    if not patches:
+        return np.empty((0, 3))
+    nodes = np.vstack(patches)
+    pairs = cKDTree(nodes).query_pairs(0.5 * min(r.spacing_m for r in field.refinements if r.rings))
+    if pairs:
+        first = nodes[min(pairs)[0]]
+        raise ValueError(
+            f"refinements with rings overlap near {first.tolist()} m: expected round patches at least two "
+            "spacings apart"
+        )
+    return nodes
 
 
 def _rings(surface: TriangleSurface, patch: Refinement) -> Array:
-    """Nodes of a round patch: its centre, rings, one of them at its radius, and one ring beyond."""
-    centre, triangle = closest_on_surface(np.array([patch.center_m]), surface)
-    normals, _ = triangle_normals(surface)
-    normal = normals[triangle[0]]
-    n_rings = max(1, round(patch.radius_m / patch.spacing_m))
-    nodes = [centre]
+    """(n, 3): a patch's centre, rings up to its radius with 6 k nodes on ring k, and one ring beyond, m.
+
+    A ring's nodes are the points of the surface at its distance from the centre, found by going back and forth
+    between sphere and surface.
+    """
+    vertices, triangles = surface.vertices, surface.triangles.astype(np.int64)
+    centre, triangle = closest_point(np.array([patch.center_m]), vertices, triangles)
+    normal = triangle_normals(surface)[0][triangle[0]]
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)
+    n_rings = max(1, round(patch.radius_m / patch.spacing_m))
+    nodes = [centre]
     for k in range(1, n_rings + 2):
-        rho = k * patch.radius_m / n_rings
+        radius = k * patch.radius_m / n_rings
         angle = 2 * np.pi * (np.arange(6 * k) + 0.5 * (k % 2)) / (6 * k)
-        ring = centre + rho * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
-        for _ in range(20):
-            ring, _ = closest_on_surface(ring, surface)
+        ring = centre + radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
+        for _ in range(100):
+            ring, _ = closest_point(ring, vertices, triangles)
             arm = ring - centre
-            ring = centre + arm * (rho / np.linalg.norm(arm, axis=1, keepdims=True))
-        ring, _ = closest_on_surface(ring, surface)
+            distance = np.linalg.norm(arm, axis=1, keepdims=True)
+            if np.all(np.abs(distance - radius) <= 1e-9 * radius):
+                break
+            ring = centre + arm * (radius / np.where(distance > 0, distance, 1.0))
+        else:
+            raise ValueError(
+                f"a round patch of radius {patch.radius_m} m finds no place around {centre[0].tolist()} m: "
+                "expected a smaller radius, or a place where the surface is larger and smoother"
+            )
         nodes.append(ring)
     return np.vstack(nodes)
+
+
+def _areas_and_normals(nodes: Array, surface: TriangleSurface, field: SpacingField) -> tuple[Array, Array]:
+    """Areas (n,), m², and unit normals (n, 3) of boundary nodes, over the part of the surface nearest to each."""
+    vertices, triangles = surface.vertices, surface.triangles.astype(np.int64)
+    face_normals, face_areas = triangle_normals(surface)
+    samples, triangle = sample_elements(vertices, triangles, field, _MEASURING)
+    owner = nearest_node(nodes, samples.points)
+    areas = tributary_measures(nodes, samples.points, samples.measures, float(face_areas.sum()))
+    # Where the body is thin a node may be nearest to a part of the far side as well; its normal is that of its own.
+    _, own = closest_point(nodes, vertices, triangles)
+    vectors = face_normals[triangle] * samples.measures[:, None]
+    same_side = np.einsum("si,si->s", face_normals[triangle], face_normals[own[owner]]) > -0.5
+    normals = np.column_stack(
+        [np.bincount(owner[same_side], v[same_side], minlength=len(nodes)) for v in vectors.T]
+    )
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return areas, np.where(length > 0, normals / np.where(length > 0, length, 1.0), face_normals[own])

@@ -1,4 +1,4 @@
-"""Fine samplings of a closed surface and of its inside, finer where the nodes are to be closer."""
+"""Fine samplings of a closed surface, its edges and its inside, finer where the nodes are to be closer."""
 
 from __future__ import annotations
 
@@ -12,91 +12,86 @@ from palpate.geometry.cloud import TriangleSurface
 from palpate.geometry.spacing import SpacingField
 
 Array = NDArray[np.float64]
-
-_INSIDE = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-
-
-@dataclass(frozen=True)
-class SurfaceSamples:
-    """Points of a surface, m (n, 3); the area of each, m² (n,); the triangle it lies in (n,); the spacing there, m."""
-
-    points: Array
-    areas: Array
-    triangles: NDArray[np.int64]
-    spacing: Array
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class InsideSamples:
-    """Points inside a surface, m (n, 3); the volume of each, m³ (n,); its distance to the surface and spacing, m."""
+class Samples:
+    """Points of a curve, a surface or a body, and the part of it that each stands for.
+
+    points    (n_samples, 3), m
+    measures  (n_samples,), length in m, area in m² or volume in m³
+    spacing   (n_samples,), spacing of the nodes there, m
+    """
 
     points: Array
-    volumes: Array
-    depths: Array
+    measures: Array
     spacing: Array
 
 
-def closest_on_surface(points: Array, surface: TriangleSurface) -> tuple[Array, NDArray[np.int64]]:
-    """Closest point of the surface to each of the points (n, 3), m, and the triangle it lies in (n,)."""
-    _, triangle, closest = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(points), surface.vertices, surface.triangles.astype(np.int64)
+def closest_point(points: Array, vertices: Array, elements: Indices) -> tuple[Array, Indices]:
+    """Closest point of a set of segments (n, 2) or triangles (n, 3) to each of the points, and the element it is in.
+
+    points (n_points, 3) and vertices (n_vertices, 3) in m; returns (n_points, 3), m, and (n_points,).
+    """
+    _, element, closest = igl.point_mesh_squared_distance(
+        np.ascontiguousarray(points), vertices, elements.astype(np.int64)
     )
-    return closest, triangle
+    return closest, element
 
 
 def depth_inside(points: Array, surface: TriangleSurface) -> Array:
     """Distance to the surface, m, (n,) for points (n, 3): positive inside, negative outside.
 
-    The side comes from the generalised winding number (Barill et al. 2018), which needs no rays.
+    The side is told by the winding number (Jacobson et al. 2013, fast form Barill et al. 2018).
     """
     distance, *_ = igl.signed_distance(
-        np.ascontiguousarray(points), surface.vertices, surface.triangles.astype(np.int64), _INSIDE
+        np.ascontiguousarray(points),
+        surface.vertices,
+        surface.triangles.astype(np.int64),
+        igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
     )
     return -distance
 
 
-def triangle_normals(surface: TriangleSurface) -> tuple[Array, Array]:
-    """Unit outward normals (n_triangles, 3) and areas (n_triangles,), m²."""
-    a, b, c = np.moveaxis(surface.vertices[surface.triangles], 1, 0)
-    cross = np.cross(b - a, c - a)
-    length = np.linalg.norm(cross, axis=1)
-    return cross / length[:, None], length / 2
+def sample_elements(
+    vertices: Array, elements: Indices, field: SpacingField, fineness: float
+) -> tuple[Samples, Indices]:
+    """Centroids of segments (n, 2) or triangles (n, 3), halved across their longest edge down to fineness * h there.
 
-
-def enclosed_volume(surface: TriangleSurface) -> float:
-    """Volume within a closed surface, m³, by the divergence theorem; negative if it is inside-out."""
-    corners = surface.vertices[surface.triangles] - surface.vertices.mean(axis=0)
-    return float(np.sum(np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]) / 6)
-
-
-def sample_surface(surface: TriangleSurface, field: SpacingField, fineness: float) -> SurfaceSamples:
-    """Centroids of the triangles, halved across their longest edge until it is below fineness * h there."""
-    corners = surface.vertices[surface.triangles]
+    Returns the samples and the element that each lies in, (n_samples,).
+    """
+    corners = vertices[elements]
+    k = corners.shape[1]
     parent = np.arange(len(corners))
-    done: list[tuple[Array, NDArray[np.int64], Array]] = []
+    done: list[tuple[Array, Indices, Array]] = []
     while len(corners):
         edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-        longest = np.argmax(edges, axis=1)
         h = field(corners.mean(axis=1))
         small = edges.max(axis=1) <= fineness * h
         done.append((corners[small], parent[small], h[small]))
-        turned = np.arange(3) + longest[~small, None]  # the longest edge from the first corner to the second
-        a, b, c = np.moveaxis(np.take_along_axis(corners[~small], turned[:, :, None] % 3, axis=1), 1, 0)
-        middle = (a + b) / 2
-        corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        # Turn each element so that its longest edge runs from its first corner to its second.
+        turn = (np.arange(k) + np.argmax(edges, axis=1)[~small, None]) % k
+        first = np.take_along_axis(corners[~small], turn[:, :, None], axis=1)
+        second = first.copy()
+        first[:, 1] = second[:, 0] = (first[:, 0] + first[:, 1]) / 2
+        corners = np.concatenate([first, second])
         parent = np.tile(parent[~small], 2)
-    corners = np.concatenate([d[0] for d in done])
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return SurfaceSamples(
-        points=corners.mean(axis=1),
-        areas=np.linalg.norm(cross, axis=1) / 2,
-        triangles=np.concatenate([d[1] for d in done]),
-        spacing=np.concatenate([d[2] for d in done]),
-    )
+    corners, parent, h = (np.concatenate(column) for column in zip(*done, strict=True))
+    sides = corners[:, 1:] - corners[:, :1]
+    if k == 2:
+        measures = np.linalg.norm(sides[:, 0], axis=1)
+    else:
+        measures = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
+    return Samples(corners.mean(axis=1), measures, h), parent
 
 
-def sample_inside(surface: TriangleSurface, field: SpacingField, fineness: float) -> InsideSamples:
-    """Midpoints of the cells of an octree, of size fineness * h at most, half that across the surface."""
+def sample_inside(surface: TriangleSurface, field: SpacingField, fineness: float) -> tuple[Samples, Array]:
+    """Midpoints of octree cells of size fineness * h at most, and their depth below the surface in m, (n_samples,).
+
+    A cell that the surface crosses counts with the part of it below the plane at its midpoint's distance; its
+    midpoint may lie outside (negative depth).
+    """
     low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
     size = fineness * field.spacing_m
     counts = np.ceil((high - low) / size).astype(int)
@@ -105,14 +100,14 @@ def sample_inside(surface: TriangleSurface, field: SpacingField, fineness: float
     octants = (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) / 2
     done: list[tuple[Array, Array, Array, Array]] = []
     while len(centres):
-        depth, h = depth_inside(centres, surface), field(centres)
-        crossing = np.abs(depth) <= size * np.sqrt(3) / 2
-        keep = (depth > 0) | crossing
-        centres, depth, h, crossing = centres[keep], depth[keep], h[keep], crossing[keep]
-        small = size <= fineness * h * np.where(crossing, 0.5, 1.0) * (1 + 1e-9)
-        leaf = small & (depth > 0)
-        done.append((centres[leaf], np.full(np.count_nonzero(leaf), size**3), depth[leaf], h[leaf]))
+        depth = depth_inside(centres, surface)
+        near = depth > -size * np.sqrt(3) / 2
+        centres, depth, h = centres[near], depth[near], field(centres[near])
+        small = size <= fineness * h * (1 + 1e-9)
+        share = np.clip(0.5 + depth / size, 0.0, 1.0)
+        leaf = small & (share > 0)
+        done.append((centres[leaf], share[leaf] * size**3, h[leaf], depth[leaf]))
         centres = (centres[~small, None, :] + size * octants).reshape(-1, 3)
         size /= 2
-    points, volumes, depths, spacing = (np.concatenate(column) for column in zip(*done, strict=True))
-    return InsideSamples(points, volumes, depths, spacing)
+    points, volumes, spacing, depths = (np.concatenate(column) for column in zip(*done, strict=True))
+    return Samples(points, volumes, spacing), depths
