@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,7 @@ def fill_surface(
     round patch finds no place on it.
     """
     check_surface(surface)
-    refinements = tuple(refinements)
+    refinements = tuple(_on_surface(r, surface) if r.rings else r for r in refinements)
     _check_spacing(surface, spacing_m, refinements)
     rng = np.random.default_rng(seed)
     field = SpacingField(spacing_m, refinements)
@@ -100,7 +101,7 @@ def _check_spacing(surface: TriangleSurface, spacing_m: float, refinements: tupl
 
 def _boundary_nodes(surface: TriangleSurface, field: SpacingField, rng: np.random.Generator) -> Array:
     """(n_boundary, 3): patch rings, then corners, sharp edges and faces of the surface, m."""
-    vertices, triangles = surface.vertices, surface.triangles.astype(np.int64)
+    vertices, triangles = surface.vertices, surface.triangles
     nodes = _patches(surface, field)
     edges, corners = sharp_edges(surface)
     nodes = np.vstack([nodes, _spread(vertices[corners], nodes, 1, field, rng)])
@@ -153,6 +154,13 @@ def _spread(
     return candidates[taken]
 
 
+def _on_surface(refinement: Refinement, surface: TriangleSurface) -> Refinement:
+    """The refinement, moved to the surface point nearest to its centre."""
+    closest, _ = closest_point(np.array([refinement.center_m]), surface.vertices, surface.triangles)
+    x, y, z = closest[0].tolist()
+    return replace(refinement, center_m=(x, y, z))
+
+
 def _patches(surface: TriangleSurface, field: SpacingField) -> Array:
     """(n, 3), nodes of the refinements with rings, m."""
     patches = [_rings(surface, r) for r in field.refinements if r.rings]
@@ -175,8 +183,9 @@ def _rings(surface: TriangleSurface, patch: Refinement) -> Array:
     A ring's nodes are the points of the surface at its distance from the centre, found by going back and forth
     between sphere and surface.
     """
-    vertices, triangles = surface.vertices, surface.triangles.astype(np.int64)
-    centre, triangle = closest_point(np.array([patch.center_m]), vertices, triangles)
+    vertices, triangles = surface.vertices, surface.triangles
+    centre = np.array([patch.center_m])
+    _, triangle = closest_point(centre, vertices, triangles)
     normal = triangle_normals(surface)[0][triangle[0]]
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
@@ -205,7 +214,7 @@ def _rings(surface: TriangleSurface, patch: Refinement) -> Array:
 
 def _areas_and_normals(nodes: Array, surface: TriangleSurface, field: SpacingField) -> tuple[Array, Array]:
     """Areas (n,), m², and unit normals (n, 3) of boundary nodes, over the part of the surface nearest to each."""
-    vertices, triangles = surface.vertices, surface.triangles.astype(np.int64)
+    vertices, triangles = surface.vertices, surface.triangles
     face_normals, face_areas = triangle_normals(surface)
     samples, triangle = sample_elements(vertices, triangles, field, _MEASURING)
     owner = nearest_node(nodes, samples.points)

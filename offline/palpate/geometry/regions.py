@@ -106,7 +106,7 @@ def contact_patch(point_m: Vector, radius_m: float, cloud: NodeCloud) -> Contact
     """
     if not (np.isfinite(radius_m) and radius_m > 0):
         raise ValueError(f"radius_m = {radius_m}: expected a length above 0")
-    vertices, triangles = cloud.surface.vertices, cloud.surface.triangles.astype(np.int64)
+    vertices, triangles = cloud.surface.vertices, cloud.surface.triangles
     closest, triangle = closest_point(np.array([point_m], dtype=float), vertices, triangles)
     center = closest[0]
     a, b, c = vertices[triangles[triangle[0]]]

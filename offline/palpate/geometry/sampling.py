@@ -12,7 +12,7 @@ from palpate.geometry.cloud import TriangleSurface
 from palpate.geometry.spacing import SpacingField
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+Indices = NDArray[np.int32] | NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ class Refinement:
     radius_m   > 0, m
     spacing_m  > 0, distance of the nodes within, m
     growth     0 < growth <= 0.5, by how much the distance grows for every metre away from the ball
-    rings      put the surface nodes of the ball on circles around the surface point nearest to the centre: one
-               node there, rings about one spacing apart, one of them exactly `radius_m` from it, and the next
-               one a spacing further out. A round tip of that radius then has the same outline at every spacing.
+    rings      move the ball to the surface point nearest to its centre and put its surface nodes on circles
+               around that: one node there, rings about one spacing apart, one of them exactly `radius_m` from it,
+               and the next one a spacing further out. A round tip then has the same outline at every spacing.
     """
 
     center_m: tuple[float, float, float]
