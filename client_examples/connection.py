@@ -1,0 +1,143 @@
+"""A client's side of the wire: connect, learn what there is, take contacts, send commands, hear forces.
+
+Needs `eclipse-zenoh` and `msgpack`. In another language the same few calls of zenoh-c, zenoh-cpp or zenoh-pico do it.
+"""
+
+import json
+import threading
+import time
+import uuid
+
+import msgpack
+import zenoh
+
+SCHEMA_VERSION = 1
+QUERY_TIMEOUT_S = 3.0
+
+
+class ServerGone(Exception):
+    """There is no server, or it has gone; the message says which, in plain words."""
+
+
+class Refused(Exception):
+    """The server said no; the message is its own."""
+
+
+class Connection:
+    """One client in one session. Use it in a `with` statement: Zenoh must be closed, or the program hangs at exit."""
+
+    def __init__(self, endpoint="tcp/127.0.0.1:7447", session="main", zenoh_config=None):
+        self.prefix = f"palpate/{session}"
+        self.endpoint = endpoint
+        # The name is part of the keys that only we use; it has to be unlike every other client's.
+        self.name = f"client-{uuid.uuid4().hex[:12]}"
+        self.gone = threading.Event()
+        self.sequence = 0
+        try:
+            self.zenoh = zenoh.open(_configuration(endpoint, zenoh_config))
+        except zenoh.ZError as error:
+            raise ServerGone(f"nothing answers at {zenoh_config or endpoint}: {error}") from error
+        try:
+            self._join()
+        except BaseException:
+            self.zenoh.close()
+            raise
+
+    def _join(self):
+        # The token is our sign of life: when it goes, because we are killed or cut off, the server takes our contacts
+        # back and lets their force fade.
+        self._token = self.zenoh.liveliness().declare_token(f"{self.prefix}/client/{self.name}")
+        # The server has one too. It tells us that the server is gone faster than any timeout could.
+        self._watch = self.zenoh.liveliness().declare_subscriber(f"{self.prefix}/server", self._on_server)
+        # Forces and commands are worth nothing when late: no batching, and drop instead of wait.
+        self._commands = self.zenoh.declare_publisher(
+            f"{self.prefix}/command/{self.name}",
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+            congestion_control=zenoh.CongestionControl.DROP,
+        )
+        self.description = self._wait_for_description()
+        version = self.description["schema_version"]
+        if version != SCHEMA_VERSION:
+            raise Refused(f"the server speaks schema version {version}, this client {SCHEMA_VERSION}")
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.zenoh.close()
+
+    def _on_server(self, sample):
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self.gone.set()
+
+    def _wait_for_description(self):
+        # Right after connecting, the other side's queryables may not be known here yet: ask again for a while.
+        give_up = time.monotonic() + QUERY_TIMEOUT_S
+        while True:
+            try:
+                return self.query("describe")
+            except ServerGone:
+                if time.monotonic() > give_up:
+                    raise
+                time.sleep(0.05)
+
+    def query(self, key, request=None):
+        """Ask the server; returns its answer (a dict). Raises Refused with its reason, ServerGone without an answer."""
+        payload = None if request is None else msgpack.packb(request)
+        for reply in self.zenoh.get(f"{self.prefix}/{key}", payload=payload, timeout=QUERY_TIMEOUT_S):
+            if reply.ok is not None:
+                return msgpack.unpackb(reply.ok.payload.to_bytes())
+            if not str(reply.err.encoding).startswith("application/msgpack"):
+                break  # not the server's words but Zenoh's: the time is over
+            refusal = msgpack.unpackb(reply.err.payload.to_bytes())
+            raise Refused(f"{refusal['message']} ({refusal['reason']})")
+        raise ServerGone(f"no server answers for {self.prefix}/{key} at {self.endpoint}")
+
+    def acquire(self, contacts):
+        """Take contacts for ourselves alone; only then are our commands for them heard."""
+        return self.query("control/acquire", {"client": self.name, "contacts": list(contacts)})
+
+    def release(self):
+        return self.query("control/release", {"client": self.name})
+
+    def command(self, displacement_m):
+        """The next command: where the tips are, {contact: [x, y, z]}, m from rest, in the model frame."""
+        self.sequence += 1
+        return {
+            "sequence": self.sequence,
+            "client_time_ns": time.monotonic_ns(),
+            "displacement_m": displacement_m,
+        }
+
+    def send(self, command):
+        self._commands.put(msgpack.packb(command))
+
+    def on_force(self, handle):
+        """Call `handle(message, arrival_ns)` for every force message, on a thread of Zenoh's: be quick there."""
+
+        def receive(sample):
+            arrival_ns = time.monotonic_ns()
+            handle(msgpack.unpackb(sample.payload.to_bytes()), arrival_ns)
+
+        self._forces = self.zenoh.declare_subscriber(f"{self.prefix}/force", receive)
+
+
+def _configuration(endpoint, zenoh_config):
+    if zenoh_config:
+        return zenoh.Config.from_file(zenoh_config)
+    config = zenoh.Config()
+    settings = {
+        "mode": "peer",
+        "listen/endpoints": [],
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": 2000,
+        "connect/exit_on_failure": True,
+        # We know where the server is; looking around the network would only find others.
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/link/tx/lease": 1000,
+    }
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config

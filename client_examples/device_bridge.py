@@ -1,0 +1,138 @@
+"""Close the loop with a haptic device: read its position, send it, render the force. Here the device is simulated.
+
+To use a real one, write a class like SimulatedDevice around its driver: `position` and `render` are all there is to it.
+
+Exit code 0: all well. 1: the contract was broken or the server went away. 2: it could not start.
+"""
+
+import argparse
+import math
+import sys
+import time
+
+import zenoh
+from connection import Connection, Refused, ServerGone
+from contract import Contract
+
+SILENCE_S = 0.1  # a device must not be left with an old force for longer
+
+
+class SimulatedDevice:
+    """A handle of some mass on a line, held by a hand that is a spring to where the person wants to be."""
+
+    def __init__(self, mass_kg, damping_n_s_per_m, hand_n_per_m):
+        self.mass_kg = mass_kg
+        self.damping_n_s_per_m = damping_n_s_per_m
+        self.hand_n_per_m = hand_n_per_m
+        self.position_m = 0.0
+        self.velocity_m_per_s = 0.0
+        self.force_n = 0.0
+
+    def render(self, force_n):
+        """The force on the hand from now on; a real driver sends it to the motors."""
+        self.force_n = force_n
+
+    def move(self, wanted_m, seconds):
+        """Semi-implicit Euler: as simple as it gets, and it does not gain energy by itself."""
+        hand = self.hand_n_per_m * (wanted_m - self.position_m)
+        acceleration = (hand + self.force_n - self.damping_n_s_per_m * self.velocity_m_per_s) / self.mass_kg
+        self.velocity_m_per_s += acceleration * seconds
+        self.position_m += self.velocity_m_per_s * seconds
+
+
+def main():
+    options = parse_options()
+    zenoh.try_init_log_from_env()  # silent unless RUST_LOG says otherwise
+    try:
+        with Connection(options.connect, options.session, options.zenoh_config) as connection:
+            return run(connection, options)
+    except (Refused, ServerGone) as error:
+        print(f"device bridge: {error}", file=sys.stderr)
+        return 2
+
+
+def run(connection, options):
+    contact = connection.description["contacts"][0]
+    contract = Contract(connection.description, contact["name"])
+    inwards = [-n for n in contact["normal"]]
+    newest = {"force": 0.0, "heard": time.monotonic()}
+
+    def on_force(message, arrival_ns):
+        contract.on_force(message, arrival_ns)
+        # The message holds what the tip does to the tissue; the hand feels the opposite. Along the line of motion:
+        force = message["force_n"][contract.index]
+        newest["force"] = -sum(f * n for f, n in zip(force, inwards, strict=True))
+        newest["heard"] = time.monotonic()
+
+    connection.on_force(on_force)
+    connection.acquire([contact["name"]])
+    device = SimulatedDevice(options.mass_kg, options.damping_n_s_per_m, options.hand_n_per_m)
+    period = connection.description["period_s"]
+    deepest = 0.0
+    trouble = None
+    start = time.monotonic()
+    for i in range(round(options.duration_s / period)):
+        wait = start + i * period - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
+        # The tip is outside the tissue until its position is inside it; then it pushes, and nothing pulls it in.
+        depth = max(device.position_m, 0.0)
+        command = connection.command({contact["name"]: [depth * n for n in inwards]})
+        contract.on_sent(command)  # before it is sent: the answer may come before `send` returns
+        connection.send(command)
+        # Never keep rendering what the server said long ago.
+        if connection.gone.is_set():
+            trouble = "the server is gone: its liveliness token was taken back"
+        elif time.monotonic() - newest["heard"] > SILENCE_S:
+            trouble = f"the server is silent: no force for {SILENCE_S} s"
+        if trouble:
+            device.render(0.0)
+            break
+        device.render(newest["force"] if depth > 0 else 0.0)
+        device.move(options.reach_m * (1 - math.cos(2 * math.pi * i * period)) / 2, period)
+        deepest = max(deepest, device.position_m)
+    if not trouble:
+        time.sleep(0.05)
+        connection.release()
+
+    summary = contract.summary()
+    trip = summary["round_trip_s"]["p50"]
+    print(f"commands answered  {summary['commands_answered']} of {summary['commands_sent']}")
+    print(f"round trip p50     {'-' if trip is None else f'{trip * 1e6:.0f}'} microseconds")
+    print(
+        f"deepest position   {deepest * 1e3:.2f} mm of the {options.reach_m * 1e3:.2f} mm that the hand reached for"
+    )
+    print(f"largest force      {summary['largest_force_n']:.4g} N")
+    for line in summary["contract_broken"]:
+        print(f"contract broken: {line}", file=sys.stderr)
+    if trouble:
+        print(f"device bridge: {trouble}", file=sys.stderr)
+    return 1 if trouble or summary["contract_broken"] or not summary["commands_answered"] else 0
+
+
+def parse_options():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--connect",
+        default="tcp/127.0.0.1:7447",
+        metavar="ENDPOINT",
+        help="where the server listens (%(default)s)",
+    )
+    parser.add_argument("--session", default="main", help="the server's --session (%(default)s)")
+    parser.add_argument(
+        "--zenoh-config", metavar="FILE", help="Zenoh configuration to use instead of --connect"
+    )
+    parser.add_argument("--mass-kg", type=float, default=0.1, help="of the handle (%(default)s)")
+    parser.add_argument("--damping-n-s-per-m", type=float, default=0.5, help="of the device (%(default)s)")
+    parser.add_argument(
+        "--hand-n-per-m", type=float, default=100.0, help="how stiffly the hand holds it (%(default)s)"
+    )
+    parser.add_argument(
+        "--reach-m", type=float, default=0.01, help="how deep the hand wants to go (%(default)s)"
+    )
+    parser.add_argument("--duration-s", type=float, default=5.0, help="(%(default)s)")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

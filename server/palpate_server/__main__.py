@@ -1,0 +1,122 @@
+"""`python -m palpate_server MODEL.npz`: serve a reduced model until SIGINT or SIGTERM."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import os
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+# The loop's process has no use for a pool of linear algebra threads; to be said before numpy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import zenoh
+
+from palpate.model import ModelFileError, load_model
+from palpate_server import transport, wire
+from palpate_server.safety import Limits
+from palpate_server.server import serve
+
+EXIT_REFUSED = 2
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    zenoh.try_init_log_from_env()  # silent unless RUST_LOG says otherwise
+    limits = Limits(
+        options.max_force_n, options.max_force_rate_n_per_s, options.max_speed_m_per_s, options.workspace_m
+    )
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        keys = wire.Keys(options.session)
+        model = load_model(options.model)
+        with transport.open_session(options.listen, options.zenoh_config) as session:
+            where = options.zenoh_config or options.listen
+            contacts = ", ".join(contact.name for contact in model.contacts)
+
+            def announce() -> None:
+                print(
+                    f"serving {model.name} (order {model.order}, contacts: {contacts}) "
+                    f"as {keys.prefix} on {where}; Ctrl-C stops",
+                    flush=True,
+                )
+
+            serve(model, limits, session, keys, stop, announce)
+    except (OSError, ModelFileError, transport.TransportError, ValueError) as error:
+        print(f"palpate serve: {error}", file=sys.stderr)
+        return EXIT_REFUSED
+    print("stopped", flush=True)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="palpate serve",
+        description="Serve a reduced tissue model over Zenoh: displacements in, forces out, 1000 times a second.",
+        epilog="The messages are described in docs/wire.md. SIGINT and SIGTERM stop the server cleanly.",
+    )
+    parser.add_argument("model", type=Path, metavar="MODEL.npz", help="model file made by `palpate build`")
+    parser.add_argument(
+        "--session",
+        default="main",
+        help="name in the key expressions palpate/SESSION/... (default: %(default)s)",
+    )
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument(
+        "--listen",
+        metavar="ENDPOINT",
+        default=transport.DEFAULT_ENDPOINT,
+        help="Zenoh endpoint to listen on (default: %(default)s, this machine only)",
+    )
+    place.add_argument(
+        "--zenoh-config",
+        type=Path,
+        metavar="FILE",
+        help="Zenoh configuration (JSON5), used as it is: TLS, access control, routers",
+    )
+    limits = parser.add_argument_group("limits", "what no client can exceed, for each contact")
+    limits.add_argument(
+        "--max-force-n", type=_positive, default=10.0, metavar="N", help="(default: %(default)s)"
+    )
+    limits.add_argument(
+        "--max-force-rate-n-per-s",
+        type=_positive,
+        default=2000.0,
+        metavar="N/S",
+        help="(default: %(default)s)",
+    )
+    limits.add_argument(
+        "--max-speed-m-per-s",
+        type=_positive,
+        default=1.0,
+        metavar="M/S",
+        help="of a tip (default: %(default)s)",
+    )
+    limits.add_argument(
+        "--workspace-m",
+        type=_positive,
+        default=0.1,
+        metavar="M",
+        help="longest displacement of a tip (default: %(default)s)",
+    )
+    return parser
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

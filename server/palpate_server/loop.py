@@ -1,0 +1,417 @@
+"""The tick: newest displacement in, one model step, force out, exactly once each period.
+
+Deadlines lie one period apart on the monotonic clock. A tick runs when a command arrives shortly before its deadline,
+so that the answer leaves at once; otherwise a compiled loop that never needs the GIL runs it at the deadline. Whoever
+comes first takes the tick lock; the other finds the deadline moved on. The deadlines slowly shift so that a steady
+client's commands arrive a quarter of a period before them.
+
+A tick that is missed is made up for at once with the newest input, up to MAX_CATCH_UP of them; what is missed beyond
+that is skipped: model time then stands still, and the skipped ticks are counted.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import int32, types, uint64
+from numpy.typing import NDArray
+
+from palpate.model import StateSpace
+from palpate_server import kernel, safety
+from palpate_server.atomics import (
+    begin_read,
+    begin_write,
+    compare_and_swap,
+    end_write,
+    is_whole,
+    load_acquire,
+    store_release,
+)
+from palpate_server.clock import monotonic_ns, sleep_until
+from palpate_server.compiled import compiled, compiled_without_gil
+from palpate_server.safety import Flags, Limits
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+RECORDS = 4096  # ticks that are kept: what publishers have not sent yet, and the recent past
+MAX_CATCH_UP = 20
+HISTOGRAM_BINS = 10_000  # of a microsecond; the last one also holds what is longer
+_BIN_NS = 1_000
+
+_RETRIES = 100  # of a read that a writer disturbs; afterwards the value before is used again
+_RETRY_NS = 20_000  # the deadline loop's nap while the other side runs the tick
+_PHASE_SHIFT_NS = 2_000  # the most that one command moves the deadlines: 0.2 % of a millisecond
+_PHASE_GAIN = 16
+
+# Columns of Memory.shared: int64 that both sides load and store atomically.
+LOCK, DEADLINE_NS, STOP, HEAD = range(4)
+# Columns of Memory.counters: written under the tick lock alone.
+TICKS, TICKS_ON_ARRIVAL, LATE_TICKS, CAUGHT_UP_TICKS, SKIPPED_TICKS, FAULTS = range(6)
+# Columns of Commands.integers; Memory.record_inputs has the age and the flags behind the first two.
+SEQUENCE, CLIENT_TIME_NS, ARRIVAL_NS = range(3)
+AGE_NS, CONTACT_FLAGS = 2, 3
+# Columns of Memory.record_times.
+START_NS, TICK_DEADLINE_NS, COMPUTE_NS, TICK_FLAGS = range(4)
+# Columns of Memory.record_motion: displacement 0:3, force 3:6, scale 6.
+SCALE = 6
+# Rows of Memory.histograms.
+TIMER_LATENESS, TICK_LATENESS, COMPUTE_TIME, INPUT_AGE = range(4)
+
+_HELD = int(Flags.HELD)
+_DECAYING = int(Flags.DECAYING)
+_STALE = int(Flags.STALE)
+_SOFT_START = int(Flags.SOFT_START)
+_FAULT = int(Flags.FAULT)
+_LATE = int(Flags.LATE)
+_CAUGHT_UP = int(Flags.CAUGHT_UP)
+
+_eventfd_write: Any = types.ExternalFunction("eventfd_write", int32(int32, uint64))
+
+
+class Commands(NamedTuple):
+    """The newest command of each contact, handed over under sequence locks. n = n_contacts.
+
+    versions (n,); integers (n, 3): SEQUENCE (-1: none yet), CLIENT_TIME_NS, ARRIVAL_NS; target (n, 3), m
+    """
+
+    versions: Integers
+    integers: Integers
+    target: Floats
+
+
+class Memory(NamedTuple):
+    """All that the tick reads and writes, made once. n = n_contacts; int64 and float64.
+
+    period_ns        (1,)
+    shared           (4,), LOCK, DEADLINE_NS, STOP, HEAD: the number of complete records
+    counters         (6,)
+    histograms       (4, HISTOGRAM_BINS) counts, and longest_ns (4,)
+    limits           (n, 4), the fields of safety.Limits
+    commands         what clients want; newest_integers and target: what the tick last read of it, same shapes
+    applied          (n, 3), m, the model's input; force, previous_force (n, 3), N; scale (n,)
+    diagonal, cross, b_transposed, c, d, state    the discrete model, as in `kernel`
+    record_times     (RECORDS, 4), record_inputs (RECORDS, n, 4), record_motion (RECORDS, n, 7): a ring, tick t at
+                     t % RECORDS
+    snapshot_every   (1,), ticks between two snapshots
+    snapshot_version (1,), sequence lock of snapshot_tick (1,), snapshot_state (order,), snapshot_applied (n, 3)
+    """
+
+    period_ns: Integers
+    shared: Integers
+    counters: Integers
+    histograms: Integers
+    longest_ns: Integers
+    limits: Floats
+    commands: Commands
+    newest_integers: Integers
+    target: Floats
+    applied: Floats
+    force: Floats
+    previous_force: Floats
+    scale: Floats
+    diagonal: Floats
+    cross: Floats
+    b_transposed: Floats
+    c: Floats
+    d: Floats
+    state: Floats
+    record_times: Integers
+    record_inputs: Integers
+    record_motion: Floats
+    snapshot_every: Integers
+    snapshot_version: Integers
+    snapshot_tick: Integers
+    snapshot_state: Floats
+    snapshot_applied: Floats
+
+
+def make_memory(
+    system: StateSpace, period_s: float, limits: Sequence[Limits], snapshot_period_s: float
+) -> Memory:
+    """A model at rest, with no command yet, whose first deadline is a period from now."""
+    n = len(limits)
+    order = system.order
+    period_ns = round(period_s * 1e9)
+    no_command = np.zeros((n, 3), np.int64)
+    no_command[:, SEQUENCE] = -1
+    shared = np.zeros(4, np.int64)
+    shared[DEADLINE_NS] = time.monotonic_ns() + period_ns
+    return Memory(
+        period_ns=np.array([period_ns]),
+        shared=shared,
+        counters=np.zeros(6, np.int64),
+        histograms=np.zeros((4, HISTOGRAM_BINS), np.int64),
+        longest_ns=np.zeros(4, np.int64),
+        limits=np.array(limits, np.float64),
+        commands=Commands(versions=np.zeros(n, np.int64), integers=no_command, target=np.zeros((n, 3))),
+        newest_integers=no_command.copy(),
+        target=np.zeros((n, 3)),
+        applied=np.zeros((n, 3)),
+        force=np.zeros((n, 3)),
+        previous_force=np.zeros((n, 3)),
+        scale=np.zeros(n),
+        diagonal=system.diagonal.copy(),
+        cross=system.cross.copy(),
+        b_transposed=np.ascontiguousarray(system.b.T),
+        c=system.c.copy(),
+        d=system.d.copy(),
+        state=np.zeros(order),
+        record_times=np.zeros((RECORDS, 4), np.int64),
+        record_inputs=np.zeros((RECORDS, n, 4), np.int64),
+        record_motion=np.zeros((RECORDS, n, 7)),
+        snapshot_every=np.array([max(1, round(snapshot_period_s / period_s))]),
+        snapshot_version=np.zeros(1, np.int64),
+        snapshot_tick=np.zeros(1, np.int64),
+        snapshot_state=np.zeros(order),
+        snapshot_applied=np.zeros((n, 3)),
+    )
+
+
+@compiled
+def write_command(
+    commands: Commands,
+    contact: int,
+    sequence: int,
+    client_time_ns: int,
+    arrival_ns: int,
+    x: float,
+    y: float,
+    z: float,
+) -> None:
+    """Hand the newest displacement (m, finite) of a contact to the loop. One thread at a time may call this."""
+    begin_write(commands.versions, contact)
+    commands.integers[contact, SEQUENCE] = sequence
+    commands.integers[contact, CLIENT_TIME_NS] = client_time_ns
+    commands.integers[contact, ARRIVAL_NS] = arrival_ns
+    commands.target[contact, 0] = x
+    commands.target[contact, 1] = y
+    commands.target[contact, 2] = z
+    end_write(commands.versions, contact)
+
+
+@compiled
+def forget_command(commands: Commands, contact: int) -> None:
+    """The contact's client is gone: its force fades from the next tick on, without being held first."""
+    begin_write(commands.versions, contact)
+    commands.integers[contact, SEQUENCE] = -1
+    end_write(commands.versions, contact)
+
+
+@compiled
+def tick_on_arrival(m: Memory, arrival_ns: int) -> int:
+    """A command came at `arrival_ns`: run the tick if its deadline is near, and pull the deadlines towards it.
+
+    Returns the number of ticks that ran.
+    """
+    if not compare_and_swap(m.shared, LOCK, 0, 1):
+        return 0  # the deadline loop is at it; the command is in its slot for this tick or the next
+    period = m.period_ns[0]
+    deadline = m.shared[DEADLINE_NS]
+    half = period // 2
+    error = (arrival_ns + period // 4 - deadline + half) % period - half
+    shift = min(max(error // _PHASE_GAIN, -_PHASE_SHIFT_NS), _PHASE_SHIFT_NS)
+    deadline += shift
+    store_release(m.shared, DEADLINE_NS, deadline)
+    ticks = 0
+    if arrival_ns >= deadline - period // 2:
+        before = m.counters[TICKS]
+        _run_due_ticks(m, arrival_ns)
+        ticks = m.counters[TICKS] - before
+        m.counters[TICKS_ON_ARRIVAL] += 1
+    store_release(m.shared, LOCK, 0)
+    return ticks
+
+
+@compiled_without_gil
+def run_at_deadlines(m: Memory, event_fd: int) -> None:
+    """Run every tick that no command has triggered, waking whoever reads `event_fd`; until STOP is set."""
+    counted = 0
+    while load_acquire(m.shared, STOP) == 0:
+        deadline = load_acquire(m.shared, DEADLINE_NS)
+        sleep_until(deadline)
+        now = monotonic_ns()
+        if deadline > counted:  # once a deadline, also when the tick is already done or must wait
+            _count(m, TIMER_LATENESS, now - deadline)
+            counted = deadline
+        if load_acquire(m.shared, DEADLINE_NS) > now:
+            continue
+        if compare_and_swap(m.shared, LOCK, 0, 1):
+            if m.shared[DEADLINE_NS] <= now:
+                _run_due_ticks(m, now)
+            store_release(m.shared, LOCK, 0)
+            _eventfd_write(event_fd, 1)
+        else:
+            sleep_until(now + _RETRY_NS)
+
+
+@compiled
+def stop(shared: Integers) -> None:
+    store_release(shared, STOP, 1)
+
+
+@compiled
+def records_written(shared: Integers) -> int:
+    """The number of ticks whose record is complete."""
+    return load_acquire(shared, HEAD)
+
+
+@compiled
+def read_snapshot(m: Memory, state: Floats, applied: Floats) -> int:
+    """Copy the last snapshot of the model into `state` (order,) and `applied` (n_contacts, 3); its tick, or -1."""
+    for _ in range(_RETRIES):
+        version = begin_read(m.snapshot_version, 0)
+        state[:] = m.snapshot_state
+        applied[:] = m.snapshot_applied
+        tick = m.snapshot_tick[0]
+        if is_whole(m.snapshot_version, 0, version):
+            return tick
+    return -1
+
+
+@compiled
+def _run_due_ticks(m: Memory, now: int) -> None:
+    """Run the next tick, and with it those whose deadlines have passed since. Called with the lock held."""
+    period = m.period_ns[0]
+    deadline = m.shared[DEADLINE_NS]
+    due = 1
+    if now > deadline:
+        due += (now - deadline) // period
+    if due > MAX_CATCH_UP:
+        m.counters[SKIPPED_TICKS] += due - MAX_CATCH_UP
+        deadline += (due - MAX_CATCH_UP) * period
+        due = MAX_CATCH_UP
+    for i in range(due):
+        _run_tick(m, deadline, i < due - 1)
+        deadline += period
+    store_release(m.shared, DEADLINE_NS, deadline)
+
+
+@compiled
+def _run_tick(m: Memory, deadline: int, missed: bool) -> None:
+    start = monotonic_ns()
+    period = m.period_ns[0]
+    tick = m.counters[TICKS]
+    row = tick % m.record_times.shape[0]
+    n_contacts = m.applied.shape[0]
+
+    lateness = start - deadline
+    tick_flags = 0
+    if lateness > period // 4:
+        tick_flags |= _LATE
+        m.counters[LATE_TICKS] += 1
+    if missed:
+        tick_flags |= _CAUGHT_UP
+        m.counters[CAUGHT_UP_TICKS] += 1
+    _count(m, TICK_LATENESS, lateness)
+
+    for i in range(n_contacts):
+        fresh = _read_command(m, i)
+        integers = m.newest_integers[i]
+        known = integers[SEQUENCE] >= 0
+        age = start - integers[ARRIVAL_NS] if known else -1
+        live = known and age <= safety.HOLD_NS
+        flags = tick_flags
+        if live:
+            if not fresh:
+                flags |= _HELD
+            _count(m, INPUT_AGE, age)
+        elif m.scale[i] == 0.0:
+            m.target[i] = 0.0  # nobody feels it any more: withdraw the tip, so that the tissue comes to rest
+        flags |= safety.follow(m.target[i], m.applied[i], m.limits[i, 3], m.limits[i, 2] * period * 1e-9)
+        scale = safety.fade(m.scale[i], live, period)
+        if live:
+            if scale < 1.0:
+                flags |= _SOFT_START
+        elif scale > 0.0:
+            flags |= _DECAYING
+        else:
+            flags |= _STALE
+        m.scale[i] = scale
+        inputs = m.record_inputs[row, i]
+        inputs[SEQUENCE] = integers[SEQUENCE]
+        inputs[CLIENT_TIME_NS] = integers[CLIENT_TIME_NS]
+        inputs[AGE_NS] = age
+        inputs[CONTACT_FLAGS] = flags
+
+    displacement = m.applied.reshape(3 * n_contacts)
+    kernel.output(m.c, m.d, m.state, displacement, m.force.reshape(3 * n_contacts))
+    if tick % m.snapshot_every[0] == 0:
+        _write_snapshot(m, tick)
+    kernel.update(m.diagonal, m.cross, m.b_transposed, m.state, displacement)
+
+    finite = True
+    for i in range(n_contacts):
+        for j in range(3):
+            finite &= math.isfinite(m.force[i, j])
+    if not finite:
+        m.counters[FAULTS] += 1
+        m.state[:] = 0.0
+        m.force[:] = 0.0
+        m.scale[:] = 0.0
+
+    for i in range(n_contacts):
+        flags = 0 if finite else _FAULT
+        for j in range(3):
+            m.force[i, j] *= m.scale[i]
+        flags |= safety.bound(m.force[i], m.previous_force[i], m.limits[i, 1] * period * 1e-9, m.limits[i, 0])
+        m.record_inputs[row, i, CONTACT_FLAGS] |= flags
+        motion = m.record_motion[row, i]
+        for j in range(3):
+            m.previous_force[i, j] = m.force[i, j]
+            motion[j] = m.applied[i, j]
+            motion[3 + j] = m.force[i, j]
+        motion[SCALE] = m.scale[i]
+
+    m.record_times[row, START_NS] = start
+    m.record_times[row, TICK_DEADLINE_NS] = deadline
+    m.record_times[row, TICK_FLAGS] = tick_flags
+    m.counters[TICKS] = tick + 1
+    compute = monotonic_ns() - start
+    m.record_times[row, COMPUTE_NS] = compute
+    _count(m, COMPUTE_TIME, compute)
+    store_release(m.shared, HEAD, tick + 1)
+
+
+@compiled
+def _read_command(m: Memory, contact: int) -> bool:
+    """Take the newest command of a contact from its slot; True when it is another one than before.
+
+    A writer that is interrupted in the middle can't hold the loop up: after some tries the value before stays.
+    """
+    commands = m.commands
+    before = m.newest_integers[contact, SEQUENCE]
+    for _ in range(_RETRIES):
+        version = begin_read(commands.versions, contact)
+        sequence = commands.integers[contact, SEQUENCE]
+        client_time = commands.integers[contact, CLIENT_TIME_NS]
+        arrival = commands.integers[contact, ARRIVAL_NS]
+        x, y, z = commands.target[contact, 0], commands.target[contact, 1], commands.target[contact, 2]
+        if is_whole(commands.versions, contact, version):
+            m.newest_integers[contact, SEQUENCE] = sequence
+            m.newest_integers[contact, CLIENT_TIME_NS] = client_time
+            m.newest_integers[contact, ARRIVAL_NS] = arrival
+            if sequence >= 0:
+                m.target[contact, 0], m.target[contact, 1], m.target[contact, 2] = x, y, z
+            return sequence != before
+    return False
+
+
+@compiled
+def _write_snapshot(m: Memory, tick: int) -> None:
+    begin_write(m.snapshot_version, 0)
+    m.snapshot_tick[0] = tick
+    m.snapshot_state[:] = m.state
+    m.snapshot_applied[:] = m.applied
+    end_write(m.snapshot_version, 0)
+
+
+@compiled
+def _count(m: Memory, histogram: int, duration_ns: int) -> None:
+    duration = max(duration_ns, 0)
+    m.longest_ns[histogram] = max(m.longest_ns[histogram], duration)
+    m.histograms[histogram, min(duration // _BIN_NS, HISTOGRAM_BINS - 1)] += 1

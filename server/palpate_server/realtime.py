@@ -1,0 +1,43 @@
+"""What the operating system can do for the loop, when it allows it: scheduling priority, memory that stays."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import resource
+import sys
+
+PRIORITY = 80  # of SCHED_FIFO, 1 to 99: above ordinary threads, below the kernel's own
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_SWITCH_INTERVAL_S = 1e-4  # after which a busy Python thread lets another one run
+
+
+def raise_priority() -> str | None:
+    """Schedule the calling thread first in, first out; or say why not."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except OSError as error:
+        return (
+            f"no real-time scheduling ({error.strerror}): expect late ticks on a busy machine; "
+            f"allow it with `ulimit -r {PRIORITY}` or the capability SYS_NICE"
+        )
+    return None
+
+
+def lock_memory() -> str | None:
+    """Keep the process's memory from being swapped out; or say why not."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if soft != resource.RLIM_INFINITY and os.geteuid() != 0:  # a limited lock makes later allocations fail
+        return f"memory is not locked (limit {soft} bytes): allow it with `ulimit -l unlimited`"
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE):
+        return f"memory is not locked ({os.strerror(ctypes.get_errno())})"
+    return None
+
+
+def calm_interpreter() -> None:
+    """Take what exists out of the garbage collector's sight, and let waiting Python threads run sooner."""
+    gc.collect()
+    gc.freeze()
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)

@@ -1,0 +1,118 @@
+"""What stands between a client's numbers and the model, and between the model and a hand: pure compiled functions.
+
+Each tick and contact, in this order: workspace and speed of the input; staleness of the input, which scales the
+force; slew rate of the force; its magnitude. (That numbers are finite is checked before they come here.)
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntFlag
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_server.compiled import compiled
+
+Floats = NDArray[np.float64]
+
+HOLD_NS = 20_000_000  # so long a silent client's last displacement and force are held,
+DECAY_NS = 50_000_000  # then its force fades to zero in this time: dead after 70 ms,
+SOFT_START_NS = 200_000_000  # and comes back in this one.
+
+
+class Flags(IntFlag):
+    """What happened to one contact in one tick (LATE and CAUGHT_UP: to the tick)."""
+
+    HELD = 1  # no command came since the last tick; the displacement before was used again
+    DECAYING = 2  # the client has been silent for longer than HOLD_NS, or is gone: the force fades to zero
+    STALE = 4  # it has faded: the force is zero and the tip is withdrawn from the tissue
+    SOFT_START = 8  # commands are coming (again); the force fades in
+    WORKSPACE_CLAMPED = 16  # the displacement was longer than the workspace's radius
+    SPEED_LIMITED = 32  # the displacement moved faster than allowed and is followed at the allowed speed
+    SLEW_LIMITED = 64  # the force changed faster than allowed
+    FORCE_CLAMPED = 128  # the force was larger than allowed
+    FAULT = 256  # the model gave a force that is not finite; it was put back to rest
+    LATE = 512  # the tick began more than a quarter of a period after its deadline
+    CAUGHT_UP = 1024  # the tick was missed and made up for, together with a later one
+
+
+class Limits(NamedTuple):
+    """Bounds for one contact; each above zero."""
+
+    max_force_n: float
+    max_force_rate_n_per_s: float
+    max_speed_m_per_s: float
+    workspace_radius_m: float
+
+
+# The numba compiler reads module constants, not enum members.
+_WORKSPACE_CLAMPED = int(Flags.WORKSPACE_CLAMPED)
+_SPEED_LIMITED = int(Flags.SPEED_LIMITED)
+_SLEW_LIMITED = int(Flags.SLEW_LIMITED)
+_FORCE_CLAMPED = int(Flags.FORCE_CLAMPED)
+
+
+@compiled
+def follow(target: Floats, applied: Floats, workspace_radius: float, max_step: float) -> int:
+    """Move `applied` (3,) towards `target` (3,), no further than `max_step` and not out of the workspace; flags.
+
+    `target` is finite; `applied` is changed in place. All in m.
+    """
+    flags = 0
+    length = math.sqrt(target[0] ** 2 + target[1] ** 2 + target[2] ** 2)
+    inside = 1.0
+    if length > workspace_radius:
+        inside = workspace_radius / length
+        flags |= _WORKSPACE_CLAMPED
+    dx = target[0] * inside - applied[0]
+    dy = target[1] * inside - applied[1]
+    dz = target[2] * inside - applied[2]
+    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+    if distance > max_step:
+        share = max_step / distance
+        applied[0] += dx * share
+        applied[1] += dy * share
+        applied[2] += dz * share
+        return flags | _SPEED_LIMITED
+    for i in range(3):
+        applied[i] = target[i] * inside
+    return flags
+
+
+@compiled
+def fade(scale: float, live: bool, period_ns: int) -> float:
+    """The next force scale, in 0 to 1: rising over SOFT_START_NS while `live`, else falling over DECAY_NS.
+
+    A linear ramp either way, so neither silence nor coming back makes the force jump.
+    """
+    if live:
+        return min(1.0, scale + period_ns / SOFT_START_NS)
+    return max(0.0, scale - period_ns / DECAY_NS)
+
+
+@compiled
+def bound(force: Floats, previous: Floats, max_change: float, max_magnitude: float) -> int:
+    """Limit `force` (3,) in place: its change from `previous` (3,), then its magnitude, directions kept; flags.
+
+    With |previous| <= max_magnitude the result obeys both limits: cutting to a ball brings no two points apart. In N.
+    """
+    flags = 0
+    dx = force[0] - previous[0]
+    dy = force[1] - previous[1]
+    dz = force[2] - previous[2]
+    change = math.sqrt(dx * dx + dy * dy + dz * dz)
+    if change > max_change:
+        share = max_change / change
+        force[0] = previous[0] + dx * share
+        force[1] = previous[1] + dy * share
+        force[2] = previous[2] + dz * share
+        flags |= _SLEW_LIMITED
+    magnitude = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+    if magnitude > max_magnitude:
+        share = max_magnitude / magnitude
+        for i in range(3):
+            force[i] *= share
+        flags |= _FORCE_CLAMPED
+    return flags

@@ -1,0 +1,360 @@
+"""The running server: wires the tick loop, the messages and the leases to a Zenoh session, and stops them again."""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from palpate.model import ReducedModel, StateSpace
+from palpate_server import loop, realtime, safety, telemetry, wire
+from palpate_server.leases import Leases, Refused
+from palpate_server.safety import Flags, Limits
+
+log = logging.getLogger("palpate_server")
+
+STATUS_PERIOD_S = 0.1
+SURFACE_PERIOD_S = 1 / 30
+MAX_UNSENT = 100  # ticks whose forces are still worth sending; what is older is dropped and counted
+_ALIVE_TIMEOUT_S = 1.0
+
+
+class Server:
+    """Serves one model in one Zenoh session, from `start` to `stop`.
+
+    Threads: Zenoh's own one that receives commands (and runs most ticks), the deadline loop (compiled, never needs
+    the GIL), one that sends the forces of its ticks, one for queries and leases, one for the surface. The thread that
+    calls `publish_status` sends the status.
+    """
+
+    def __init__(self, model: ReducedModel, limits: Limits, session: zenoh.Session, keys: wire.Keys) -> None:
+        self.model = model
+        self.limits = limits
+        self.session = session
+        self.keys = keys
+        self.names = [contact.name for contact in model.contacts]
+        self.leases = Leases(self.names)
+        self.messages = telemetry.MessageCounters()
+        self.memory = loop.make_memory(
+            model.discrete, model.period_s, [limits] * len(self.names), SURFACE_PERIOD_S
+        )
+        self._contact_index = {name: i for i, name in enumerate(self.names)}
+        self._last_sequence = [-1] * len(self.names)
+        self._state = "running"
+        self._events: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._stopping = threading.Event()
+        self._wake = os.eventfd(0)
+        self._sending = threading.Lock()
+        self._sent = 0
+
+    # Start and stop
+
+    def start(self) -> None:
+        warm_up(self.model.period_s, len(self.names))
+        session, keys = self.session, self.keys
+        real_time = zenoh.Priority.REAL_TIME
+        drop = zenoh.CongestionControl.DROP
+        self._force = session.declare_publisher(
+            keys.force, encoding=wire.ENCODING, priority=real_time, express=True, congestion_control=drop
+        )
+        self._status = session.declare_publisher(
+            keys.status, encoding=wire.ENCODING, priority=zenoh.Priority.DATA, congestion_control=drop
+        )
+        self._surface = session.declare_publisher(
+            keys.surface, encoding=wire.ENCODING, priority=zenoh.Priority.DATA_LOW, congestion_control=drop
+        )
+        self._declared: list[Any] = [
+            session.declare_queryable(keys.describe, self._later(self._answer_describe)),
+            session.declare_queryable(keys.geometry, self._later(self._answer_geometry)),
+            session.declare_queryable(keys.control("*"), self._later(self._answer_control)),
+            session.liveliness().declare_subscriber(keys.client("*"), self._later(self._on_liveliness)),
+            session.declare_subscriber(keys.command("*"), self._on_command),
+        ]
+        self._threads = [
+            threading.Thread(target=target, name=name, daemon=True)
+            for name, target in (
+                ("deadlines", self._run_deadlines),
+                ("forces", self._send_at_deadlines),
+                ("queries", self._serve_events),
+                ("surface", self._publish_surfaces),
+            )
+        ]
+        if notice := realtime.lock_memory():
+            log.warning(notice)
+        realtime.calm_interpreter()
+        self.memory.shared[loop.DEADLINE_NS] = time.monotonic_ns() + self.memory.period_ns[0]
+        for thread in self._threads:
+            thread.start()
+        # Last, as the sign that everything else answers.
+        self._declared.append(session.liveliness().declare_token(keys.server))
+
+    def stop(self) -> None:
+        """Let the forces fade, say so in a last status, stop the loop and take everything back from the session."""
+        self._state = "stopping"
+        for contact in range(len(self.names)):
+            loop.forget_command(self.memory.commands, contact)
+        time.sleep((safety.DECAY_NS * 1e-9) + 10 * self.model.period_s)
+        self.publish_status()
+        loop.stop(self.memory.shared)
+        self._stopping.set()
+        self._events.put(None)
+        self._threads[0].join()
+        os.eventfd_write(self._wake, 1)
+        for thread in self._threads[1:]:
+            thread.join()
+        for declared in reversed(self._declared):
+            declared.undeclare()
+        os.close(self._wake)
+
+    # Commands in, forces out
+
+    def _on_command(self, sample: zenoh.Sample) -> None:
+        """Runs on Zenoh's thread for every command: hand it over, and tick if it is time."""
+        arrival_ns = time.monotonic_ns()
+        messages = self.messages
+        payload = sample.payload
+        try:
+            if len(payload) > wire.MAX_COMMAND_BYTES:
+                raise wire.MalformedMessage("too_large", f"payload has {len(payload)} bytes")
+            command = wire.decode_command(payload.to_bytes())
+        except wire.MalformedMessage as error:
+            messages.malformed[error.reason] += 1
+            return
+        if reason := self._why_refused(command, wire.last_chunk(str(sample.key_expr))):
+            messages.refused[reason] += 1
+            return
+        messages.accepted += 1
+        for name, (x, y, z) in command.displacement_m.items():
+            contact = self._contact_index[name]
+            self._last_sequence[contact] = command.sequence
+            loop.write_command(
+                self.memory.commands, contact, command.sequence, command.client_time_ns, arrival_ns, x, y, z
+            )
+        if loop.tick_on_arrival(self.memory, arrival_ns):
+            self._send_forces()
+
+    def _why_refused(self, command: wire.Command, client: str) -> str | None:
+        """One of wire.REFUSED, or None when the command is to be carried out. Refused as a whole or not at all."""
+        if self._state != "running":
+            return "stopping"
+        for name in command.displacement_m:
+            contact = self._contact_index.get(name)
+            if contact is None:
+                return "unknown_contact"
+            if self.leases.holders[name] != client:
+                return "not_holder"
+            if command.sequence <= self._last_sequence[contact]:
+                return "old_sequence"
+        return None if wire.is_finite(command) else "not_finite"
+
+    def _send_forces(self) -> None:
+        """Publish the ticks that are not sent yet, in order, unless another thread is at it (which then is told)."""
+        if not self._sending.acquire(blocking=False):
+            os.eventfd_write(self._wake, 1)
+            return
+        try:
+            memory = self.memory
+            head = int(loop.records_written(memory.shared))
+            if head - self._sent > MAX_UNSENT:
+                self.messages.unsent_forces += head - self._sent - MAX_UNSENT
+                self._sent = head - MAX_UNSENT
+            while self._sent < head:
+                row = self._sent % loop.RECORDS
+                payload = wire.encode_force(
+                    self._sent,
+                    int(memory.record_times[row, loop.START_NS]),
+                    memory.record_inputs[row].tolist(),
+                    memory.record_motion[row].tolist(),
+                )
+                self._force.put(payload)
+                self._sent += 1
+        finally:
+            self._sending.release()
+
+    def _run_deadlines(self) -> None:
+        if notice := realtime.raise_priority():
+            log.warning(notice)
+        loop.run_at_deadlines(self.memory, self._wake)
+
+    def _send_at_deadlines(self) -> None:
+        while not self._stopping.is_set():
+            os.eventfd_read(self._wake)
+            self._send_forces()
+
+    # Status and surface
+
+    def publish_status(self) -> None:
+        status = telemetry.status(
+            self._state, time.monotonic_ns(), self.memory, self.messages, self.leases.holders
+        )
+        self._status.put(wire.pack(status))
+
+    def _publish_surfaces(self) -> None:
+        surface = self.model.surface
+        state = np.zeros(self.model.order)
+        applied = np.zeros((len(self.names), 3))
+        last_tick = -1
+        while not self._stopping.wait(SURFACE_PERIOD_S):
+            tick = loop.read_snapshot(self.memory, state, applied)
+            if tick <= last_tick or not self._surface.matching_status:
+                continue
+            last_tick = tick
+            displacement = surface.output @ state.astype(np.float32)
+            displacement += surface.feedthrough @ applied.ravel().astype(np.float32)
+            self._surface.put(wire.encode_surface(tick, time.monotonic_ns(), displacement))
+
+    # Queries and leases, one after another on a thread of their own
+
+    def _later(self, handle: Callable[[Any], None]) -> Callable[[Any], None]:
+        """A Zenoh callback that only leaves the work for the query thread, so that it can't stall the session."""
+        return lambda event: self._events.put(lambda: handle(event))
+
+    def _serve_events(self) -> None:
+        while (event := self._events.get()) is not None:
+            try:
+                event()
+            except Exception:  # one client's query must not end the service of the others
+                log.exception("a query could not be answered")
+
+    def _answer_describe(self, query: zenoh.Query) -> None:
+        with query:
+            description = describe(self.model, self.limits, self.keys.session)
+            query.reply(self.keys.describe, wire.pack(description), encoding=wire.ENCODING)
+
+    def _answer_geometry(self, query: zenoh.Query) -> None:
+        with query:
+            surface = self.model.surface
+            payload = wire.encode_geometry(surface.vertices, surface.triangles)
+            query.reply(self.keys.geometry, payload, encoding=wire.ENCODING)
+
+    def _answer_control(self, query: zenoh.Query) -> None:
+        with query:
+            try:
+                reply = self._carry_out(wire.last_chunk(str(query.key_expr)), _request(query))
+            except wire.MalformedMessage as error:
+                refusal = {"reason": error.reason, "message": str(error)}
+                query.reply_err(wire.pack(refusal), encoding=wire.ENCODING)
+            except Refused as error:
+                refusal = {"reason": error.reason, "message": str(error)}
+                query.reply_err(wire.pack(refusal), encoding=wire.ENCODING)
+            else:
+                query.reply(query.key_expr, wire.pack(reply), encoding=wire.ENCODING)
+
+    def _carry_out(self, action: str, request: dict[str, Any]) -> dict[str, Any]:
+        client = request.get("client")
+        if not wire.is_name(client):
+            raise wire.MalformedMessage(
+                "wrong_type", f"client is {client!r}: expected 1 to 64 of A-Z a-z 0-9 _ -"
+            )
+        assert isinstance(client, str)
+        if action == "acquire":
+            return {"contacts": self._acquire(client, request.get("contacts"))}
+        if action == "release":
+            return {"contacts": self._release(client)}
+        raise Refused("unknown_action", f"no control action is called {action!r}: there are acquire, release")
+
+    def _acquire(self, client: str, contacts: object) -> list[str]:
+        if not isinstance(contacts, list) or not contacts or not all(isinstance(c, str) for c in contacts):
+            raise wire.MalformedMessage("wrong_type", f"contacts is {contacts!r}: expected a list of names")
+        if self._state != "running":
+            raise Refused("stopping", "the server is stopping")
+        token = self.keys.client(client)
+        alive = any(
+            reply.ok is not None for reply in self.session.liveliness().get(token, timeout=_ALIVE_TIMEOUT_S)
+        )
+        if not alive:
+            raise Refused("not_alive", f"client {client!r} has no liveliness token at {token}")
+        self.leases.acquire(client, contacts)
+        for name in contacts:
+            contact = self._contact_index[name]
+            loop.forget_command(self.memory.commands, contact)
+            self._last_sequence[contact] = -1
+        return contacts
+
+    def _release(self, client: str) -> list[str]:
+        released = self.leases.release(client)
+        for name in released:
+            loop.forget_command(self.memory.commands, self._contact_index[name])
+        return list(released)
+
+    def _on_liveliness(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE:
+            client = wire.last_chunk(str(sample.key_expr))
+            for name in self._release(client):
+                log.info("client %s is gone: contact %s is free", client, name)
+
+
+def describe(model: ReducedModel, limits: Limits, session: str) -> dict[str, Any]:
+    """The describe reply: what a client must know before it moves anything."""
+    summary = model.summary()
+    summary["evidence"].pop("hankel_singular_values")
+    return {
+        "schema_version": wire.SCHEMA_VERSION,
+        "session": session,
+        "period_s": model.period_s,
+        "contacts": [asdict(contact) for contact in model.contacts],
+        "limits": limits._asdict(),
+        "hold_s": safety.HOLD_NS * 1e-9,
+        "decay_s": safety.DECAY_NS * 1e-9,
+        "soft_start_s": safety.SOFT_START_NS * 1e-9,
+        "status_period_s": STATUS_PERIOD_S,
+        "surface_period_s": SURFACE_PERIOD_S,
+        "flags": {flag.name: flag.value for flag in Flags},
+        "model": summary,
+    }
+
+
+def warm_up(period_s: float, n_contacts: int) -> None:
+    """Compile (or load from the cache) every function of the real-time path, on a model of its own."""
+    channels = 3 * n_contacts
+    system = StateSpace(
+        np.zeros(2),
+        np.zeros(2),
+        np.zeros((2, channels)),
+        np.zeros((channels, 2)),
+        np.zeros((channels, channels)),
+    )
+    memory = loop.make_memory(system, period_s, [Limits(1.0, 1.0, 1.0, 1.0)] * n_contacts, SURFACE_PERIOD_S)
+    loop.write_command(memory.commands, 0, 1, 1, 1, 0.0, 0.0, 0.0)
+    loop.forget_command(memory.commands, 0)
+    loop.tick_on_arrival(memory, time.monotonic_ns())
+    loop.records_written(memory.shared)
+    loop.read_snapshot(memory, np.zeros(2), np.zeros((n_contacts, 3)))
+    loop.stop(memory.shared)
+    wake = os.eventfd(0)
+    loop.run_at_deadlines(memory, wake)
+    os.close(wake)
+
+
+def _request(query: zenoh.Query) -> dict[str, Any]:
+    payload = query.payload
+    if payload is None:
+        raise wire.MalformedMessage("missing_field", "the query has no payload: expected a map")
+    if len(payload) > wire.MAX_REQUEST_BYTES:
+        raise wire.MalformedMessage("too_large", f"payload has {len(payload)} bytes")
+    return wire.unpack_map(payload.to_bytes(), wire.MAX_REQUEST_BYTES)
+
+
+def serve(
+    model: ReducedModel,
+    limits: Limits,
+    session: zenoh.Session,
+    keys: wire.Keys,
+    stop: threading.Event,
+    on_ready: Callable[[], None] = lambda: None,
+) -> None:
+    """Serve until `stop` is set."""
+    server = Server(model, limits, session, keys)
+    server.start()
+    on_ready()
+    while not stop.wait(STATUS_PERIOD_S):
+        server.publish_status()
+    server.stop()

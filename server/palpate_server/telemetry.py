@@ -1,0 +1,95 @@
+"""What the loop and the wire have been doing, as plain numbers: the status message."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_server import loop
+from palpate_server.safety import Flags
+from palpate_server.wire import MALFORMED, REFUSED
+
+ROLLING_TICKS = 100
+_BIN_S = 1e-6
+
+
+class MessageCounters:
+    """How many commands were accepted, refused and malformed, by reason; each written by the receiving thread."""
+
+    def __init__(self) -> None:
+        self.accepted = 0
+        self.refused: Counter[str] = Counter(dict.fromkeys(REFUSED, 0))
+        self.malformed: Counter[str] = Counter(dict.fromkeys(MALFORMED, 0))
+        self.unsent_forces = 0
+
+
+def percentiles(counts: NDArray[np.int64], longest_ns: int) -> dict[str, float | None]:
+    """p50, p99, p99.9 and the maximum, in seconds, from a histogram with bins of a microsecond; None when empty.
+
+    A percentile is its bin's upper edge; one in the last bin, which also holds all that is longer, is the maximum.
+    """
+    cumulative = np.cumsum(counts)
+    total = int(cumulative[-1])
+    if total == 0:
+        return dict.fromkeys(("p50", "p99", "p99_9", "max"))
+    longest_s = longest_ns * 1e-9
+
+    def at(share: float) -> float:
+        index = int(np.searchsorted(cumulative, share * total))
+        return longest_s if index >= len(counts) - 1 else min((index + 1) * _BIN_S, longest_s)
+
+    return {"p50": at(0.5), "p99": at(0.99), "p99_9": at(0.999), "max": longest_s}
+
+
+def recent_success_rate(memory: loop.Memory, contact: int) -> float:
+    """Share of the last 100 ticks in which a new command of the contact's client had come in time."""
+    head = int(loop.records_written(memory.shared))
+    if head == 0:
+        return 0.0
+    ticks = np.arange(max(0, head - ROLLING_TICKS), head) % loop.RECORDS
+    flags = memory.record_inputs[ticks, contact, loop.CONTACT_FLAGS]
+    late = Flags.HELD | Flags.DECAYING | Flags.STALE
+    return float(np.mean(flags & int(late) == 0))
+
+
+def status(
+    state: str,
+    server_time_ns: int,
+    memory: loop.Memory,
+    messages: MessageCounters,
+    holders: Mapping[str, str | None],
+) -> dict[str, Any]:
+    """The status message; `state` is "running" or "stopping"."""
+    ticks = memory.counters.tolist()
+    durations = {
+        "timer_lateness_s": loop.TIMER_LATENESS,
+        "tick_lateness_s": loop.TICK_LATENESS,
+        "compute_time_s": loop.COMPUTE_TIME,
+        "input_age_s": loop.INPUT_AGE,
+    }
+    return {
+        "state": state,
+        "server_time_ns": server_time_ns,
+        "ticks": ticks[loop.TICKS],
+        "ticks_on_arrival": ticks[loop.TICKS_ON_ARRIVAL],
+        "late_ticks": ticks[loop.LATE_TICKS],
+        "caught_up_ticks": ticks[loop.CAUGHT_UP_TICKS],
+        "skipped_ticks": ticks[loop.SKIPPED_TICKS],
+        "faults": ticks[loop.FAULTS],
+        **{
+            name: percentiles(memory.histograms[row].copy(), int(memory.longest_ns[row]))
+            for name, row in durations.items()
+        },
+        "accepted": messages.accepted,
+        "refused": dict(messages.refused),
+        "malformed": dict(messages.malformed),
+        "unsent_forces": messages.unsent_forces,
+        "contacts": {
+            name: {"holder": holder, "success_rate": recent_success_rate(memory, index)}
+            for index, (name, holder) in enumerate(holders.items())
+        },
+    }

@@ -1,0 +1,52 @@
+"""Zenoh sessions as this server wants them: loopback, no scouting, unless a configuration file says otherwise."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import zenoh
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+LEASE_MS = 1000  # after which a peer that does not answer counts as gone
+
+
+class TransportError(Exception):
+    """The session can't be opened; the message says what was asked for and why it failed."""
+
+
+def open_session(listen: str | None, config_file: Path | None) -> zenoh.Session:
+    """A session that listens on an endpoint, or one with exactly the configuration in a file.
+
+    Raises TransportError when the file can't be read, or the endpoint is malformed or in use.
+    """
+    try:
+        if config_file is not None:
+            if not config_file.is_file():
+                raise TransportError(f"zenoh configuration {config_file}: no such file")
+            config = zenoh.Config.from_file(config_file)
+        else:
+            config = _listening_peer(listen or DEFAULT_ENDPOINT)
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        origin = f"zenoh configuration {config_file}" if config_file else f"endpoint {listen}"
+        raise TransportError(f"{origin}: {_first_cause(error)}") from error
+
+
+def _listening_peer(endpoint: str) -> zenoh.Config:
+    config = zenoh.Config()
+    settings = {
+        "mode": "peer",
+        "listen/endpoints": [endpoint],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/link/tx/lease": LEASE_MS,
+    }
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _first_cause(error: zenoh.ZError) -> str:
+    """Zenoh's own words without the places in its source, which follow each cause."""
+    return str(error).split(" at /", 1)[0].strip().rstrip(".") or "refused"

@@ -1,0 +1,226 @@
+"""Key expressions and messages: the only module that knows what the bytes on the wire look like.
+
+Every payload is one msgpack map; quantities are SI, with the unit in the field's name. `docs/wire.md` is this module for
+people who write clients in other languages, and a test holds the two together.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+SCHEMA_VERSION = 1
+ENCODING = "application/msgpack;palpate.v1"
+MAX_COMMAND_BYTES = 4096
+MAX_REQUEST_BYTES = 16384
+
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_MAX_INT64 = 2**63 - 1
+
+
+class MalformedMessage(ValueError):
+    """A payload that breaks the schema. `reason` is one of MALFORMED, the message says what was wrong."""
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+# Why a payload can't be read, and why a readable command is not carried out: the counters in the status message.
+MALFORMED = ("too_large", "not_msgpack", "not_a_map", "missing_field", "wrong_type", "wrong_shape")
+REFUSED = ("not_finite", "unknown_contact", "not_holder", "old_sequence", "stopping")
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The key expressions of one session; a session's name is 1 to 64 of A-Z a-z 0-9 _ -."""
+
+    session: str
+
+    def __post_init__(self) -> None:
+        if not is_name(self.session):
+            raise ValueError(f"session is {self.session!r}: expected 1 to 64 of A-Z a-z 0-9 _ -")
+
+    @property
+    def prefix(self) -> str:
+        return f"palpate/{self.session}"
+
+    @property
+    def server(self) -> str:
+        """Liveliness token of the server."""
+        return f"{self.prefix}/server"
+
+    def client(self, name: str) -> str:
+        """Liveliness token of a client: its contacts are its own for as long as this stands."""
+        return f"{self.prefix}/client/{name}"
+
+    def command(self, client: str) -> str:
+        return f"{self.prefix}/command/{client}"
+
+    @property
+    def force(self) -> str:
+        return f"{self.prefix}/force"
+
+    @property
+    def status(self) -> str:
+        return f"{self.prefix}/status"
+
+    @property
+    def surface(self) -> str:
+        return f"{self.prefix}/surface"
+
+    @property
+    def describe(self) -> str:
+        return f"{self.prefix}/describe"
+
+    @property
+    def geometry(self) -> str:
+        return f"{self.prefix}/geometry"
+
+    def control(self, action: str) -> str:
+        return f"{self.prefix}/control/{action}"
+
+
+@dataclass(frozen=True)
+class Command:
+    """Where a client's tool tips are: displacement of named contacts from rest, m, in the model frame."""
+
+    sequence: int
+    client_time_ns: int
+    displacement_m: Mapping[str, tuple[float, float, float]]
+
+
+def is_name(text: object) -> bool:
+    """True for what may stand in a key expression as one chunk: 1 to 64 of A-Z a-z 0-9 _ -."""
+    return isinstance(text, str) and _NAME.fullmatch(text) is not None
+
+
+def last_chunk(key: str) -> str:
+    return key.rpartition("/")[2]
+
+
+def pack(message: Mapping[str, Any]) -> bytes:
+    return msgpack.packb(message)
+
+
+def unpack_map(payload: bytes, max_bytes: int) -> dict[str, Any]:
+    """Read a map with string keys, bounded in size before anything is decoded. Raises MalformedMessage."""
+    if len(payload) > max_bytes:
+        raise MalformedMessage("too_large", f"payload has {len(payload)} bytes: expected at most {max_bytes}")
+    try:
+        message = msgpack.unpackb(payload, raw=False, strict_map_key=True)
+    except (ValueError, RecursionError, OverflowError) as error:
+        raise MalformedMessage("not_msgpack", f"payload is not one msgpack value ({error})") from error
+    except Exception as error:  # the decoder is fed whatever the network brings: no cause may get past it
+        raise MalformedMessage("not_msgpack", f"payload can't be decoded ({error!r})") from error
+    if type(message) is not dict:
+        raise MalformedMessage("not_a_map", f"payload is a {type(message).__name__}: expected a map")
+    return message
+
+
+def decode_command(payload: bytes) -> Command:
+    """Read a tool command; numbers may be infinite or NaN (a refusal, not a malformed message).
+
+    Raises MalformedMessage. Fields that are not known are ignored, so that the schema can grow.
+    """
+    message = unpack_map(payload, MAX_COMMAND_BYTES)
+    displacement = _field(message, "displacement_m", dict)
+    if not displacement:
+        raise MalformedMessage("wrong_shape", "displacement_m is empty: expected at least one contact")
+    return Command(
+        sequence=_count(message, "sequence"),
+        client_time_ns=_count(message, "client_time_ns"),
+        displacement_m={str(name): _vector(name, vector) for name, vector in displacement.items()},
+    )
+
+
+def is_finite(command: Command) -> bool:
+    return all(math.isfinite(sum(map(abs, vector))) for vector in command.displacement_m.values())
+
+
+def encode_force(
+    tick: int,
+    server_time_ns: int,
+    inputs: Sequence[Sequence[int]],
+    motion: Sequence[Sequence[float]],
+) -> bytes:
+    """One tick's answer; lists run over the contacts in the order of the describe reply.
+
+    inputs  a row a contact: sequence, client_time_ns, age_ns (all -1 without a command), flags
+    motion  a row a contact: displacement x y z (m), force x y z (N), force scale
+    """
+    return msgpack.packb(
+        {
+            "tick": tick,
+            "server_time_ns": server_time_ns,
+            "sequence": [row[0] for row in inputs],
+            "client_time_ns": [row[1] for row in inputs],
+            "input_age_ns": [row[2] for row in inputs],
+            "flags": [row[3] for row in inputs],
+            "displacement_m": [row[0:3] for row in motion],
+            "force_n": [row[3:6] for row in motion],
+            "force_scale": [row[6] for row in motion],
+        }
+    )
+
+
+def encode_surface(tick: int, server_time_ns: int, displacement: NDArray[np.float32]) -> bytes:
+    """Displacement of every surface vertex, (3 n_vertices,) m, x y z of vertex 0 first, as little-endian float32."""
+    return msgpack.packb(
+        {
+            "tick": tick,
+            "server_time_ns": server_time_ns,
+            "displacement_m": displacement.astype("<f4", copy=False).tobytes(),
+        }
+    )
+
+
+def encode_geometry(vertices: NDArray[np.float64], triangles: NDArray[np.int32]) -> bytes:
+    """The surface at rest: vertices (n_vertices, 3), m, as little-endian float32; triangles (n, 3) as int32."""
+    return msgpack.packb(
+        {
+            "schema_version": SCHEMA_VERSION,
+            "n_vertices": len(vertices),
+            "n_triangles": len(triangles),
+            "vertices_m": vertices.astype("<f4").tobytes(),
+            "triangles": triangles.astype("<i4").tobytes(),
+        }
+    )
+
+
+def _field(message: Mapping[str, Any], name: str, expected: type) -> Any:
+    try:
+        value = message[name]
+    except KeyError:
+        raise MalformedMessage("missing_field", f"{name} is missing") from None
+    if type(value) is not expected:
+        raise MalformedMessage(
+            "wrong_type", f"{name} is a {type(value).__name__}: expected {expected.__name__}"
+        )
+    return value
+
+
+def _count(message: Mapping[str, Any], name: str) -> int:
+    value = _field(message, name, int)
+    if not 0 <= value <= _MAX_INT64:
+        raise MalformedMessage("wrong_type", f"{name} is {value}: expected 0 to 2^63 - 1")
+    return int(value)
+
+
+def _vector(name: object, value: object) -> tuple[float, float, float]:
+    if type(value) is not list or len(value) != 3:
+        raise MalformedMessage("wrong_shape", f"displacement_m of {name!r}: expected 3 numbers")
+    for number in value:
+        if type(number) is not float and type(number) is not int:
+            raise MalformedMessage(
+                "wrong_type", f"displacement_m of {name!r} holds a {type(number).__name__}: expected numbers"
+            )
+    x, y, z = value
+    return float(x), float(y), float(z)

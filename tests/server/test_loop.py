@@ -1,0 +1,279 @@
+"""The tick, driven by hand: the test says when commands arrive and when deadlines pass."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from numba import njit
+
+from palpate.model import ReducedModel, StateSpace
+from palpate_server import atomics, loop, safety
+from palpate_server.safety import Flags, Limits
+
+FREE = Limits(1e6, 1e12, 1e6, 1e6)  # limits that nothing here reaches
+PERIOD_NS = 1_000_000
+
+
+def command(memory: loop.Memory, sequence: int, target: tuple[float, float, float], age_ns: int = 0) -> None:
+    loop.write_command(memory.commands, 0, sequence, 7, time.monotonic_ns() - age_ns, *target)
+
+
+def tick(memory: loop.Memory) -> tuple[int, np.ndarray, np.ndarray, float]:
+    """Run one tick on arrival; its flags, applied displacement, force and scale."""
+    now = time.monotonic_ns()
+    memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS // 4
+    assert loop.tick_on_arrival(memory, now) == 1
+    row = (loop.records_written(memory.shared) - 1) % loop.RECORDS
+    motion = memory.record_motion[row, 0]
+    flags = int(memory.record_inputs[row, 0, loop.CONTACT_FLAGS]) & ~int(Flags.LATE)
+    return flags, motion[0:3].copy(), motion[3:6].copy(), float(motion[loop.SCALE])
+
+
+@pytest.fixture
+def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> loop.Memory:
+    model = make_spring_mass_model()
+    return loop.make_memory(model.discrete, model.period_s, [FREE], 1 / 30)
+
+
+@pytest.fixture
+def stop_threads() -> Iterator[Callable[[loop.Memory, threading.Thread], None]]:
+    running: list[tuple[loop.Memory, threading.Thread]] = []
+    yield lambda memory, thread: running.append((memory, thread))
+    for memory, thread in running:
+        loop.stop(memory.shared)
+        thread.join(10)
+        assert not thread.is_alive()
+
+
+def test_without_a_command_the_force_is_zero_and_stale(memory: loop.Memory) -> None:
+    flags, _, force, scale = tick(memory)
+    assert flags == Flags.STALE
+    assert scale == 0
+    np.testing.assert_array_equal(force, 0)
+
+
+def test_forces_are_the_discrete_models_response_to_the_applied_displacements(
+    memory: loop.Memory, make_spring_mass_model: Callable[..., ReducedModel]
+) -> None:
+    system = make_spring_mass_model().discrete
+    state = np.zeros(system.order)
+    for i in range(500):
+        command(memory, i, (1e-3 * np.sin(0.1 * i), 2e-3 * np.cos(0.03 * i), 1e-4 * i))
+        _, applied, force, scale = tick(memory)
+        expected = system.c @ state + system.d @ applied
+        state = system.dense_a() @ state + system.b @ applied
+        np.testing.assert_allclose(force, scale * expected, rtol=0, atol=1e-12)
+    assert scale == 1
+
+
+def test_force_fades_in_after_the_first_command(memory: loop.Memory) -> None:
+    scales = []
+    for i in range(250):
+        command(memory, i, (0.0, 0.0, 1e-3))
+        flags, *_, scale = tick(memory)
+        scales.append(scale)
+        assert bool(flags & Flags.SOFT_START) == (scale < 1)
+    assert np.diff(scales).max() <= PERIOD_NS / safety.SOFT_START_NS * (1 + 1e-9)
+    assert scales[-1] == 1
+
+
+def test_a_silent_client_is_held_then_faded_to_zero_and_withdrawn(memory: loop.Memory) -> None:
+    for i in range(250):
+        command(memory, i, (0.0, 0.0, 1e-3))
+        tick(memory)
+    command(memory, 250, (0.0, 0.0, 1e-3), age_ns=safety.HOLD_NS // 2)
+    tick(memory)
+    flags, applied, force, scale = tick(memory)
+    assert flags == Flags.HELD
+    assert scale == 1
+    held = np.linalg.norm(force)
+
+    command(memory, 251, (0.0, 0.0, 1e-3), age_ns=safety.HOLD_NS + PERIOD_NS)
+    forces = []
+    for _ in range(round(safety.DECAY_NS / PERIOD_NS) + 1):
+        flags, applied, force, scale = tick(memory)
+        forces.append(np.linalg.norm(force))
+        assert flags == (Flags.DECAYING if scale else Flags.STALE)
+    assert forces[-1] == 0
+    assert max(-np.diff([held, *forces])) < 3 * held * PERIOD_NS / safety.DECAY_NS
+    assert applied[2] in (0.0, 1e-3)
+    _, applied, *_ = tick(memory)
+    np.testing.assert_array_equal(applied, 0)
+
+
+def test_a_forgotten_client_fades_without_being_held(memory: loop.Memory) -> None:
+    for i in range(250):
+        command(memory, i, (0.0, 0.0, 1e-3))
+        tick(memory)
+    loop.forget_command(memory.commands, 0)
+    flags, applied, _, scale = tick(memory)
+    assert flags == Flags.DECAYING
+    assert scale < 1
+    assert applied[2] == 1e-3  # the tip stays while somebody may still feel it
+
+
+def test_recovery_in_the_middle_of_the_fading_goes_on_from_there(memory: loop.Memory) -> None:
+    for i in range(250):
+        command(memory, i, (0.0, 0.0, 1e-3))
+        tick(memory)
+    loop.forget_command(memory.commands, 0)
+    for _ in range(25):
+        *_, before = tick(memory)
+    command(memory, 1000, (0.0, 0.0, 1e-3))
+    flags, _, _, after = tick(memory)
+    assert 0 < before < after < before + 0.01
+    assert flags == Flags.SOFT_START
+
+
+def test_a_jump_is_followed_at_the_speed_limit(make_spring_mass_model: Callable[..., ReducedModel]) -> None:
+    model = make_spring_mass_model()
+    memory = loop.make_memory(model.discrete, model.period_s, [FREE._replace(max_speed_m_per_s=0.5)], 1 / 30)
+    depths = []
+    for i in range(40):
+        command(memory, i, (0.0, 0.0, 0.01))
+        flags, applied, *_ = tick(memory)
+        depths.append(applied[2])
+        assert bool(flags & Flags.SPEED_LIMITED) == (applied[2] < 0.01)
+    np.testing.assert_allclose(np.diff(depths[:19]), 0.5e-3)
+    assert depths[-1] == 0.01
+
+
+def test_a_model_that_gives_nan_is_put_to_rest_and_counted(memory: loop.Memory) -> None:
+    for i in range(10):
+        command(memory, i, (0.0, 0.0, 1e-3))
+        tick(memory)
+    memory.state[0] = np.nan
+    flags, _, force, scale = tick(memory)
+    assert flags & Flags.FAULT
+    assert scale == 0
+    np.testing.assert_array_equal(force, 0)
+    assert memory.counters[loop.FAULTS] == 1
+    flags, _, force, _ = tick(memory)
+    assert not flags & Flags.FAULT
+    assert np.all(np.isfinite(force))
+
+
+def test_an_early_command_waits_for_the_tick_and_a_second_one_replaces_it(memory: loop.Memory) -> None:
+    now = time.monotonic_ns()
+    memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS - 100_000
+    command(memory, 1, (0.0, 0.0, 1e-3))
+    assert loop.tick_on_arrival(memory, now) == 0
+    command(memory, 2, (0.0, 0.0, 2e-3))
+    assert loop.tick_on_arrival(memory, now + PERIOD_NS * 6 // 10) == 1
+    assert memory.record_inputs[0, 0, loop.SEQUENCE] == 2
+    assert loop.tick_on_arrival(memory, now + PERIOD_NS * 7 // 10) == 0  # one tick each period
+
+
+def test_deadlines_settle_a_quarter_of_a_period_behind_steady_arrivals(memory: loop.Memory) -> None:
+    start = time.monotonic_ns()
+    for offset in (0, 170_000, 480_000, 730_000, 999_000):
+        memory.shared[loop.DEADLINE_NS] = start + offset
+        ticks = 0
+        for i in range(600):
+            ticks += loop.tick_on_arrival(memory, start + i * PERIOD_NS)
+        phase = (memory.shared[loop.DEADLINE_NS] - start) % PERIOD_NS
+        assert abs(phase - PERIOD_NS // 4) < PERIOD_NS // 50
+        assert abs(ticks - 600) <= 1
+
+
+def test_missed_ticks_are_made_up_for_and_too_many_are_skipped(memory: loop.Memory) -> None:
+    now = time.monotonic_ns()
+    memory.shared[loop.DEADLINE_NS] = now - 5 * PERIOD_NS - PERIOD_NS // 2
+    assert loop.tick_on_arrival(memory, now) == 6
+    assert memory.counters[loop.CAUGHT_UP_TICKS] == 5
+    flags = memory.record_inputs[:6, 0, loop.CONTACT_FLAGS]
+    np.testing.assert_array_equal(flags & int(Flags.CAUGHT_UP) > 0, [True] * 5 + [False])
+
+    memory.shared[loop.DEADLINE_NS] = now - 100 * PERIOD_NS - PERIOD_NS // 2
+    assert loop.tick_on_arrival(memory, now) == loop.MAX_CATCH_UP
+    assert memory.counters[loop.SKIPPED_TICKS] == 101 - loop.MAX_CATCH_UP
+    assert 0 < memory.shared[loop.DEADLINE_NS] - now < PERIOD_NS
+
+
+def test_the_deadline_loop_steps_once_each_period_of_wall_time(
+    memory: loop.Memory, stop_threads: Callable[[loop.Memory, threading.Thread], None]
+) -> None:
+    wake = os.eventfd(0)
+    memory.shared[loop.DEADLINE_NS] = start = time.monotonic_ns()
+    thread = threading.Thread(target=loop.run_at_deadlines, args=(memory, wake))
+    stop_threads(memory, thread)
+    thread.start()
+    time.sleep(0.5)
+    loop.stop(memory.shared)
+    thread.join()
+    stopped = memory.shared[loop.DEADLINE_NS]  # of the first tick that did not run
+    ticks = memory.counters[loop.TICKS] + memory.counters[loop.SKIPPED_TICKS]
+    assert ticks == (stopped - start) // PERIOD_NS
+    assert ticks >= 400
+    os.close(wake)
+
+
+def test_the_deadline_loop_goes_on_while_python_is_busy(
+    memory: loop.Memory, stop_threads: Callable[[loop.Memory, threading.Thread], None]
+) -> None:
+    wake = os.eventfd(0)
+    thread = threading.Thread(target=loop.run_at_deadlines, args=(memory, wake))
+    stop_threads(memory, thread)
+    memory.shared[loop.DEADLINE_NS] = time.monotonic_ns()
+    thread.start()
+    time.sleep(0.05)
+    before = memory.counters[loop.TICKS]
+    sorted(range(8_000_000), key=lambda i: -i)  # holds the GIL, with only short breaks
+    assert memory.counters[loop.TICKS] - before > 100
+    loop.stop(memory.shared)
+    thread.join()
+    os.close(wake)
+
+
+@njit(nogil=True)
+def _write_pairs(commands: loop.Commands, n: int) -> None:
+    for i in range(n):
+        loop.write_command(commands, 0, i, i, i, float(i), float(i), float(i))
+
+
+@njit(nogil=True)
+def _count_torn(commands: loop.Commands, n: int) -> tuple[int, int]:
+    torn = whole = 0
+    for _ in range(n):
+        version = atomics.begin_read(commands.versions, 0)
+        sequence = commands.integers[0, 0]
+        arrival = commands.integers[0, 2]
+        x, z = commands.target[0, 0], commands.target[0, 2]
+        if atomics.is_whole(commands.versions, 0, version):
+            whole += 1
+            if not (sequence == arrival and x == z and x == float(sequence)):
+                torn += 1
+    return torn, whole
+
+
+def test_a_reader_never_sees_half_a_command(memory: loop.Memory) -> None:
+    _write_pairs(memory.commands, 1)
+    _count_torn(memory.commands, 1)
+    writer = threading.Thread(target=_write_pairs, args=(memory.commands, 20_000_000))
+    writer.start()
+    torn, whole = 0, 0
+    while writer.is_alive():
+        more_torn, more_whole = _count_torn(memory.commands, 100_000)
+        torn, whole = torn + more_torn, whole + more_whole
+    writer.join()
+    assert whole > 1000
+    assert torn == 0
+
+
+def test_a_snapshot_belongs_to_one_tick(make_spring_mass_model: Callable[..., ReducedModel]) -> None:
+    model = make_spring_mass_model()
+    memory = loop.make_memory(model.discrete, model.period_s, [FREE], 1e-3)
+    system: StateSpace = model.discrete
+    expected = np.zeros(system.order)
+    state, applied = np.zeros(system.order), np.zeros((1, 3))
+    for i in range(50):
+        command(memory, i, (1e-3 * i, 0.0, 0.0))
+        tick(memory)
+        assert loop.read_snapshot(memory, state, applied) == i
+        np.testing.assert_allclose(state, expected, rtol=1e-12, atol=1e-18)
+        expected = system.dense_a() @ expected + system.b @ applied.ravel()

@@ -1,0 +1,74 @@
+"""The safety functions as pure functions: what they promise for any finite input."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from palpate_server import safety
+from palpate_server.safety import Flags
+
+coordinate = st.floats(-1e6, 1e6)
+vector = st.tuples(coordinate, coordinate, coordinate).map(np.array)
+positive = st.floats(1e-6, 1e3)
+ROUNDING = 1e-12
+
+
+@settings(deadline=None)
+@given(target=vector, applied=vector, radius=positive, max_step=positive)
+def test_the_tip_moves_no_further_than_a_step_and_ends_inside_the_workspace(
+    target: NDArray[np.float64], applied: NDArray[np.float64], radius: float, max_step: float
+) -> None:
+    size = np.linalg.norm(applied)
+    if size > radius:
+        applied = applied * (radius / size)
+    before = applied.copy()
+    flags = safety.follow(target, applied, radius, max_step)
+    assert np.linalg.norm(applied - before) <= max_step * (1 + ROUNDING) + ROUNDING * radius
+    assert np.linalg.norm(applied) <= radius * (1 + ROUNDING)
+    assert bool(flags & Flags.WORKSPACE_CLAMPED) == (
+        math.sqrt(target[0] ** 2 + target[1] ** 2 + target[2] ** 2) > radius
+    )
+    if not flags:
+        np.testing.assert_array_equal(applied, target)
+
+
+@settings(deadline=None)
+@given(force=vector, previous=vector, max_change=positive, max_magnitude=positive)
+def test_the_force_is_bounded_in_change_and_in_magnitude(
+    force: NDArray[np.float64], previous: NDArray[np.float64], max_change: float, max_magnitude: float
+) -> None:
+    size = np.linalg.norm(previous)
+    if size > max_magnitude:
+        previous = previous * (max_magnitude / size)
+    wanted = force.copy()
+    flags = safety.bound(force, previous, max_change, max_magnitude)
+    largest = np.abs(wanted).max() + max_magnitude
+    assert np.linalg.norm(force) <= max_magnitude * (1 + ROUNDING)
+    assert np.linalg.norm(force - previous) <= max_change + ROUNDING * largest
+    if not flags:
+        np.testing.assert_array_equal(force, wanted)
+
+
+def test_a_silent_client_is_faded_out_linearly_and_faded_in_again_more_slowly() -> None:
+    period_ns = 1_000_000
+    scale, scales = 1.0, []
+    while scale > 0:
+        scale = safety.fade(scale, False, period_ns)
+        scales.append(scale)
+    assert len(scales) * period_ns in (safety.DECAY_NS, safety.DECAY_NS + period_ns)  # rounding of the sum
+    np.testing.assert_allclose(np.diff(scales[:-1]), -period_ns / safety.DECAY_NS)
+    ticks = 0
+    while scale < 1:
+        scale = safety.fade(scale, True, period_ns)
+        ticks += 1
+    assert ticks * period_ns in (safety.SOFT_START_NS, safety.SOFT_START_NS + period_ns)
+
+
+def test_hold_and_decay_together_leave_room_below_a_tenth_of_a_second() -> None:
+    assert safety.HOLD_NS == 20_000_000
+    assert safety.HOLD_NS + safety.DECAY_NS < 100_000_000

@@ -1,0 +1,175 @@
+"""Messages: what is read, what is refused and under which name, and that the page about them is true."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from palpate_server import wire
+from palpate_server.safety import Flags
+
+PAGE = Path(__file__).parents[2] / "docs" / "wire.md"
+GOOD = {"sequence": 3, "client_time_ns": 5, "displacement_m": {"tip": [0.0, 1e-3, -2]}}
+
+json_like = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=20,
+)
+
+
+def test_a_command_is_read_as_it_was_meant() -> None:
+    command = wire.decode_command(msgpack.packb(GOOD))
+    assert command == wire.Command(3, 5, {"tip": (0.0, 1e-3, -2.0)})
+    assert wire.is_finite(command)
+
+
+def test_unknown_fields_are_ignored_so_that_the_schema_can_grow() -> None:
+    assert wire.decode_command(msgpack.packb(GOOD | {"later": [1]})).sequence == 3
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"", "not_msgpack"),
+        (b"\xc1", "not_msgpack"),
+        (msgpack.packb(GOOD)[:-3], "not_msgpack"),
+        (msgpack.packb(GOOD) + b"\x00", "not_msgpack"),
+        (b"\x91" * 4000, "not_msgpack"),
+        (msgpack.packb([1, 2]), "not_a_map"),
+        (msgpack.packb({1: 2}), "not_msgpack"),
+        (bytes(10_000_000), "too_large"),
+        (msgpack.packb({k: v for k, v in GOOD.items() if k != "sequence"}), "missing_field"),
+        (msgpack.packb(GOOD | {"sequence": True}), "wrong_type"),
+        (msgpack.packb(GOOD | {"sequence": -1}), "wrong_type"),
+        (msgpack.packb(GOOD | {"sequence": 2**63}), "wrong_type"),
+        (msgpack.packb(GOOD | {"client_time_ns": 1.5}), "wrong_type"),
+        (msgpack.packb(GOOD | {"displacement_m": [0, 0, 0]}), "wrong_type"),
+        (msgpack.packb(GOOD | {"displacement_m": {}}), "wrong_shape"),
+        (msgpack.packb(GOOD | {"displacement_m": {"tip": [0, 0]}}), "wrong_shape"),
+        (msgpack.packb(GOOD | {"displacement_m": {"tip": [0, 0, 0, 0]}}), "wrong_shape"),
+        (msgpack.packb(GOOD | {"displacement_m": {"tip": [0, 0, "0"]}}), "wrong_type"),
+        (msgpack.packb(GOOD | {"displacement_m": {"tip": [0, 0, None]}}), "wrong_type"),
+    ],
+)
+def test_a_malformed_command_is_named_by_what_is_wrong(payload: bytes, reason: str) -> None:
+    with pytest.raises(wire.MalformedMessage) as caught:
+        wire.decode_command(payload)
+    assert caught.value.reason == reason
+    assert reason in wire.MALFORMED
+
+
+@settings(max_examples=300, deadline=None)
+@given(payload=st.binary(max_size=300))
+def test_random_bytes_are_malformed_or_a_command_but_nothing_else(payload: bytes) -> None:
+    try:
+        wire.decode_command(payload)
+    except wire.MalformedMessage as error:
+        assert error.reason in wire.MALFORMED
+
+
+@settings(max_examples=300, deadline=None)
+@given(field=st.sampled_from(sorted(GOOD)), value=json_like, name=st.text(max_size=5))
+def test_any_value_in_any_field_gives_a_whole_command_or_a_reason(
+    field: str, value: object, name: str
+) -> None:
+    for replacement in (value, {name: value}, {name: [value, 0.0, value]}):
+        try:
+            command = wire.decode_command(msgpack.packb(GOOD | {field: replacement}))
+        except wire.MalformedMessage as error:
+            assert error.reason in wire.MALFORMED
+        else:
+            assert 0 <= command.sequence < 2**63
+            for vector in command.displacement_m.values():
+                assert [type(number) for number in vector] == [float] * 3
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_numbers_that_are_not_finite_are_recognised(bad: float) -> None:
+    for axis in range(3):
+        vector = [0.0, 0.0, 0.0]
+        vector[axis] = bad
+        command = wire.decode_command(msgpack.packb(GOOD | {"displacement_m": {"tip": vector}}))
+        assert not wire.is_finite(command)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "*", "a b", "@a", "x" * 65, None, 3])
+def test_names_that_could_change_a_key_expression_are_refused(name: object) -> None:
+    assert not wire.is_name(name)
+
+
+def test_forces_carry_numbers_unchanged() -> None:
+    motion = [[0.1, 0.2, 0.3, 1 / 3, -2 / 3, 1e-300, 0.5]]
+    message = msgpack.unpackb(wire.encode_force(9, 10, [[1, 2, 3, 4]], motion))
+    assert message["force_n"] == [motion[0][3:6]]
+    assert message["displacement_m"] == [motion[0][0:3]]
+    assert message["force_scale"] == [0.5]
+    assert (message["sequence"], message["client_time_ns"], message["input_age_ns"], message["flags"]) == (
+        [1],
+        [2],
+        [3],
+        [4],
+    )
+
+
+def test_surface_displacements_are_little_endian_float32() -> None:
+    displacement = np.array([1.5, -2.25, 0.0], np.float32)
+    message = msgpack.unpackb(wire.encode_surface(1, 2, displacement))
+    np.testing.assert_array_equal(np.frombuffer(message["displacement_m"], "<f4"), displacement)
+
+
+def _table(heading: str) -> list[list[str]]:
+    """Rows of the first table below a heading of the page, without its two header lines."""
+    below = PAGE.read_text().split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    rows = [line.strip("|").split("|") for line in below.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in row] for row in rows[2:]]
+
+
+def test_the_page_lists_exactly_the_flags_of_the_code() -> None:
+    written = {row[1].strip("`"): int(row[0]) for row in _table("Flags")}
+    assert written == {flag.name: flag.value for flag in Flags}
+
+
+def test_the_page_lists_exactly_the_reasons_of_the_code() -> None:
+    rows = {row[0]: set(re.findall(r"`(\w+)`", row[1])) for row in _table("Counters")}
+    assert rows["`malformed`"] == set(wire.MALFORMED)
+    assert rows["`refused`"] == set(wire.REFUSED)
+
+
+def test_the_page_lists_the_keys_of_the_code() -> None:
+    keys = wire.Keys("SESSION")
+    expected = {
+        keys.server,
+        keys.client("CLIENT"),
+        keys.command("CLIENT"),
+        keys.force,
+        keys.status,
+        keys.surface,
+        keys.describe,
+        keys.geometry,
+        keys.control("ACTION"),
+    }
+    assert {row[0].strip("`") for row in _table("Keys")} == expected
+
+
+def test_the_page_lists_exactly_the_fields_of_a_force() -> None:
+    message = msgpack.unpackb(wire.encode_force(0, 0, [[0] * 4], [[0.0] * 7]))
+    assert [row[0].strip("`") for row in _table("Force")] == list(message)
+
+
+def test_the_page_lists_exactly_the_fields_of_a_command() -> None:
+    assert [row[0].strip("`") for row in _table("Command")] == list(GOOD)
+
+
+def test_the_page_names_the_schema_version_the_encoding_and_the_size_limit() -> None:
+    text = PAGE.read_text()
+    assert f"schema version {wire.SCHEMA_VERSION}" in text
+    assert wire.ENCODING in text
+    assert f"{wire.MAX_COMMAND_BYTES} bytes" in text
