@@ -106,7 +106,8 @@ class DiagonalSystem:
 
     def _residues(self) -> Complex:
         """(n_poles, n_outputs n_inputs): c_k b_k^T, real for real poles."""
-        residues = np.einsum("pk,km->kpm", self.c, self.b).reshape(len(self.poles), -1)
+        products = np.einsum("pk,km->kpm", self.c, self.b)
+        residues = products.reshape(len(self.poles), self.n_outputs * self.n_inputs)
         residues.imag[~self.is_pair] = 0.0
         return residues
 

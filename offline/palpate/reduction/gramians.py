@@ -1,0 +1,296 @@
+"""Low-rank factors of the Gramians of a diagonal system, in real coordinates.
+
+Real coordinates: a real pole has one state; a pair has two, sqrt(2) Re x and sqrt(2) Im x of the complex state x of its
+upper pole, so that the change of basis is unitary. Its block of A is [[a, -w], [w, a]] for the pole a + jw. States
+follow the order of the poles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from palpate.diagonal_system import DiagonalSystem
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RealForm:
+    """A diagonal system in real coordinates.
+
+    decay, rotation  (n_states,): A x = decay * x + rotation * x[partner]
+    partner          (n_states,), the other state of a pair; the state itself for a real pole
+    b (n_states, n_inputs), c (n_outputs, n_states)
+    signature        (n_states,), +-1: diag(signature) A^T diag(signature) = A; for a symmetric system also
+                     C = B^T diag(signature)
+    """
+
+    decay: Array
+    rotation: Array
+    partner: NDArray[np.intp]
+    b: Array
+    c: Array
+    signature: Array
+
+    def apply(self, x: Array) -> Array:
+        """A x for x (n_states, k)."""
+        return self.decay[:, None] * x + self.rotation[:, None] * x[self.partner]
+
+
+@dataclass(frozen=True)
+class GramianFactor:
+    """A Gramian P = L L^T + R, R symmetric positive semidefinite.
+
+    factor    (n_states, rank), L in real coordinates
+    trace     trace of P
+    residual  trace of R, so the 2-norm of what L misses is at most this
+    """
+
+    factor: Array
+    trace: float
+    residual: float
+
+
+def real_form(system: DiagonalSystem) -> RealForm:
+    """The system in real coordinates (exact; see the module's text)."""
+    start, is_pair = _first_state(system), system.is_pair
+    n = system.n_states
+    real, pair = start[~is_pair], start[is_pair]
+    decay, rotation, partner = np.empty(n), np.zeros(n), np.arange(n)
+    decay[real], decay[pair], decay[pair + 1] = (
+        system.poles.real[~is_pair],
+        system.poles.real[is_pair],
+        system.poles.real[is_pair],
+    )
+    rotation[pair], rotation[pair + 1] = -system.poles.imag[is_pair], system.poles.imag[is_pair]
+    partner[pair], partner[pair + 1] = pair + 1, pair
+    signature = np.ones(n)
+    signature[pair + 1] = -1.0
+    # Of a real pole the rows are real or imaginary (the square root of a real residue): j times j makes the sign.
+    imaginary = np.any(system.b.imag[~is_pair] != 0, axis=1)
+    signature[real] = np.where(imaginary, -1.0, 1.0)
+    b = _in_real_coordinates(system, system.b)
+    c = (_in_real_coordinates(system, system.c.T) * signature[:, None]).T
+    return RealForm(decay, rotation, partner, b, c, signature)
+
+
+def controllability_factor(system: DiagonalSystem, tolerance: float) -> GramianFactor:
+    """Factor of P, A P + P A^T + B B^T = 0, until the trace of the rest is below tolerance times that of P.
+
+    Pivoted Cholesky of the Cauchy-form Gramian P_kl = -b_k b_l^* / (lambda_k + conj(lambda_l)). Its Schur complements
+    keep that form, with b multiplied by a Blaschke factor (Gohberg, Kailath, Olshevsky 1995), so a column costs
+    O(n_states n_inputs) instead of O(n_states rank) and the factor keeps its relative accuracy however small the
+    tolerance. It is low-rank ADI with the pivot's pole as shift and its row of b as tangential direction.
+
+    Raises ValueError unless every pole lies in the open left half plane.
+    """
+    return _cauchy_factor(system, system.b, tolerance)
+
+
+def observability_factor(system: DiagonalSystem, tolerance: float) -> GramianFactor:
+    """Factor of Q, A^T Q + Q A + C^T C = 0, as `controllability_factor`."""
+    signature = real_form(system).signature
+    dual = _cauchy_factor(system, np.ascontiguousarray(system.c.T), tolerance)
+    return GramianFactor(signature[:, None] * dual.factor, dual.trace, dual.residual)
+
+
+def band_controllability_factor(
+    system: DiagonalSystem, band: tuple[float, float], n_frequencies: int
+) -> Array:
+    """(n_states, 2 n_inputs n_frequencies): L with L L^T about the controllability Gramian limited to the band.
+
+    band  (low, high), rad/s, 0 <= low < high
+
+    P = 1/(2 pi) times the integral over |omega| in the band of (j omega - A)^-1 B B^* (j omega - A)^-*, by
+    `band_quadrature`; +-omega together give the real and the imaginary part of a column (Gawronski & Juang 1990).
+    """
+    slowest = float(np.min(np.abs(system.poles)))
+    omega, weight = band_quadrature(band, slowest, n_frequencies)
+    n, m = system.n_states, system.n_inputs
+    form = real_form(system)
+    columns = np.empty((n, len(omega), 2, m))
+    for i, (w, scale) in enumerate(zip(omega, np.sqrt(weight / np.pi), strict=True)):
+        # (jw - A) x = B on each block [[a, -r], [r, a]]: x = ((jw - a) b + r' b[partner]) / ((jw - a)² + r²)
+        shift = 1j * w - form.decay
+        x = (shift[:, None] * form.b + form.rotation[:, None] * form.b[form.partner]) * (
+            scale / (shift**2 + form.rotation**2)
+        )[:, None]
+        single = form.partner == np.arange(n)
+        x[single] = form.b[single] * (scale / shift[single])[:, None]
+        columns[:, i, 0], columns[:, i, 1] = x.real, x.imag
+    return columns.reshape(n, -1)
+
+
+def band_quadrature(band: tuple[float, float], slowest: float, n_points: int) -> tuple[Array, Array]:
+    """Points (rad/s) and weights of composite Gauss-Legendre quadrature over the band, about n_points of them.
+
+    slowest  smallest |pole|, rad/s. Panels of 4 points are even in log(omega) above a tenth of it, where the
+             integrand varies over octaves; below, where it is nearly constant, one panel goes down to the band's start.
+    """
+    low, high = band
+    knee = min(max(low, slowest / 10), high)
+    n_panels = max(1, n_points // 4)
+    edges: Array = np.array([low])
+    if knee > low:
+        edges = np.append(edges, knee)
+        n_panels = max(1, n_panels - 1)
+    if high > knee:
+        edges = np.append(edges, knee * (high / knee) ** (np.arange(1, n_panels + 1) / n_panels))
+    x, w = np.polynomial.legendre.leggauss(4)
+    half = np.diff(edges) / 2
+    middle = (edges[1:] + edges[:-1]) / 2
+    return (middle[:, None] + half[:, None] * x).ravel(), (half[:, None] * w).ravel()
+
+
+def _first_state(system: DiagonalSystem) -> NDArray[np.intp]:
+    """(n_poles,): index of each pole's first real state."""
+    sizes = np.where(system.is_pair, 2, 1)
+    return np.cumsum(sizes) - sizes
+
+
+def _in_real_coordinates(system: DiagonalSystem, rows: NDArray[np.complex128]) -> Array:
+    """(n_states, k) from complex rows (n_poles, k)."""
+    start, is_pair = _first_state(system), system.is_pair
+    out = np.empty((system.n_states, rows.shape[1]))
+    out[start[~is_pair]] = rows.real[~is_pair] + rows.imag[~is_pair]
+    out[start[is_pair]] = np.sqrt(2) * rows.real[is_pair]
+    out[start[is_pair] + 1] = np.sqrt(2) * rows.imag[is_pair]
+    return out
+
+
+def _cauchy_factor(system: DiagonalSystem, rows: NDArray[np.complex128], tolerance: float) -> GramianFactor:
+    if not system.spectral_abscissa < 0:
+        raise ValueError(
+            f"the spectral abscissa is {system.spectral_abscissa:.3g} 1/s: Gramians exist for poles in the open left "
+            "half plane only"
+        )
+    is_pair = system.is_pair
+    generator = np.where(is_pair[:, None], rows, rows.real + rows.imag)
+    generator = np.ascontiguousarray(generator, dtype=np.complex128)
+    poles = np.ascontiguousarray(system.poles)
+    diagonal = np.sum(np.abs(generator) ** 2, axis=1) / (-2 * poles.real) * np.where(is_pair, 2, 1)
+    trace = float(np.sum(diagonal))
+    start = _first_state(system)
+    blocks: list[Array] = []
+    residual = trace
+    rank = 0
+    while residual > tolerance * trace and rank < system.n_states:
+        columns = np.zeros((256, system.n_states))
+        n_columns, residual = _eliminate(
+            poles, is_pair, start, generator, diagonal, tolerance * trace, columns
+        )
+        blocks.append(columns[:n_columns])
+        rank += n_columns
+        if n_columns == 0:
+            break
+    factor = np.concatenate(blocks).T if blocks else np.zeros((system.n_states, 0))
+    return GramianFactor(factor, trace, residual)
+
+
+@njit(cache=True)
+def _eliminate(poles, is_pair, start, generator, diagonal, target, columns):  # type: ignore[no-untyped-def]
+    """Fill `columns` with Cholesky columns, largest remaining diagonal block first, updating generator and diagonal.
+
+    Returns (number of columns filled, remaining trace); stops at the target or when no pair of columns fits.
+    """
+    n, m = generator.shape
+    direction = np.empty(m, dtype=np.complex128)
+    second = np.empty(m, dtype=np.complex128)
+    count = 0
+    residual = diagonal.sum()
+    while residual > target and count + 2 <= columns.shape[0]:
+        j = np.argmax(diagonal)
+        pivot = poles[j]
+        a = pivot.real
+        length2 = 0.0
+        product = 0j  # conj(b_j) conj(b_j)^T, what couples the pivot to its conjugate
+        for i in range(m):
+            direction[i] = generator[j, i]
+            length2 += direction[i].real ** 2 + direction[i].imag ** 2
+            product += np.conj(direction[i]) ** 2
+        if length2 == 0.0:
+            break
+        p = -length2 / (2 * a)
+
+        if is_pair[j]:
+            # The pivot block [[p + Re q, Im q], [Im q, p - Re q]] has eigenvalues p +- |q|.
+            q = -np.conj(product) / (2 * pivot)
+            angle = 0.5 * np.arctan2(q.imag, q.real)
+            cosine, sine = np.cos(angle), np.sin(angle)
+            large, small = p + abs(q), p - abs(q)
+            factor = 2 * a / (2 * np.conj(pivot) * length2)
+            second2 = 0.0
+            for i in range(m):
+                second[i] = np.conj(direction[i]) - factor * product * direction[i]
+                second2 += second[i].real ** 2 + second[i].imag ** 2
+            two = small > 1e-14 * large and second2 > 0.0
+            first_scale = 1 / np.sqrt(large)
+            second_scale = 1 / np.sqrt(small) if two else 0.0
+        else:
+            two = False
+            first_scale = 1 / np.sqrt(p)
+
+        residual = 0.0
+        for k in range(n):
+            if k == j:
+                inner = length2 + 0j
+                cross = np.conj(product)
+            else:
+                inner = 0j
+                cross = 0j
+                for i in range(m):
+                    inner += generator[k, i] * np.conj(direction[i])
+                    cross += generator[k, i] * direction[i]
+            inverse = 1 / (poles[k] + np.conj(pivot))
+            s = -inner * inverse
+            row = start[k]
+            if is_pair[j]:
+                mirror = 1 / (poles[k] + pivot)
+                t = -cross * mirror
+                if is_pair[k]:
+                    xx, xy = s.real + t.real, t.imag - s.imag
+                    yx, yy = s.imag + t.imag, s.real - t.real
+                    columns[count, row] = (xx * cosine + xy * sine) * first_scale
+                    columns[count, row + 1] = (yx * cosine + yy * sine) * first_scale
+                    if two:
+                        columns[count + 1, row] = (-xx * sine + xy * cosine) * second_scale
+                        columns[count + 1, row + 1] = (-yx * sine + yy * cosine) * second_scale
+                else:
+                    x, y = np.sqrt(2.0) * s.real, -np.sqrt(2.0) * s.imag
+                    columns[count, row] = (x * cosine + y * sine) * first_scale
+                    if two:
+                        columns[count + 1, row] = (-x * sine + y * cosine) * second_scale
+            elif is_pair[k]:
+                columns[count, row] = np.sqrt(2.0) * s.real * first_scale
+                columns[count, row + 1] = np.sqrt(2.0) * s.imag * first_scale
+            else:
+                columns[count, row] = s.real * first_scale
+
+            if k == j:
+                for i in range(m):
+                    generator[k, i] = 0j
+                diagonal[k] = 0.0
+                continue
+            scale = 2 * a * inverse * inner / length2
+            for i in range(m):
+                generator[k, i] -= scale * direction[i]
+            if is_pair[j] and second2 > 0.0:
+                inner = 0j
+                for i in range(m):
+                    inner += generator[k, i] * np.conj(second[i])
+                scale = 2 * a * mirror * inner / second2
+                for i in range(m):
+                    generator[k, i] -= scale * second[i]
+            left = 0.0
+            for i in range(m):
+                if not is_pair[k]:
+                    generator[k, i] = generator[k, i].real + 0j
+                left += generator[k, i].real ** 2 + generator[k, i].imag ** 2
+            diagonal[k] = -left / (2 * poles[k].real) * (2 if is_pair[k] else 1)
+            residual += diagonal[k]
+        count += 2 if two else 1
+    return count, residual

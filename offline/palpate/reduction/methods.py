@@ -1,0 +1,289 @@
+"""Four ways to reduce a viscoelastic body to a few states, by order or by the force error inside a frequency band."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.diagonal_system import DiagonalSystem
+from palpate.model import StateSpace
+from palpate.reduction.block_form import diagonalise, to_block_form
+from palpate.reduction.frequencies import band_frequencies, relative_errors
+from palpate.reduction.gramians import (
+    RealForm,
+    band_controllability_factor,
+    controllability_factor,
+    observability_factor,
+    real_form,
+)
+
+Method = Literal["tbr", "tbr-band", "modal", "modal-static"]
+METHODS: tuple[Method, ...] = ("tbr", "tbr-band", "modal", "modal-static")
+
+Array = NDArray[np.float64]
+
+# The trace of what a Gramian factor leaves out, relative to the Gramian's. Hankel singular values are off by about its
+# square root at worst, so this keeps them to 1e-10 of the largest.
+_GRAMIAN_TOLERANCE = 1e-20
+_BAND_FREQUENCIES = 120
+_RANK_TOLERANCE = 1e-13  # Hankel singular values below it, relative, are round-off
+
+
+class ReductionError(ValueError):
+    """A system can't be reduced as asked; the message says why."""
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """A reduced model dx/dt = A x + B u, F = C x + D u and what its method knows about it.
+
+    system                  in diagonal form, every pole in the open left half plane
+    hankel_singular_values  (k,), of the Gramians that were balanced, largest first; empty for modal methods
+    error_bound             upper bound, in the units of F, on the largest error over all frequencies; None without
+    """
+
+    method: Method
+    system: DiagonalSystem
+    hankel_singular_values: Array
+    error_bound: float | None
+
+    @property
+    def order(self) -> int:
+        """Number of real states (that of `state_space` is one more where this is odd)."""
+        return self.system.n_states
+
+    @property
+    def state_space(self) -> StateSpace:
+        """In real block-diagonal form."""
+        return to_block_form(self.system)
+
+
+@dataclass(frozen=True)
+class _Family:
+    """The reduced systems of one method.
+
+    orders  the orders it has, ascending
+    at      the system of an order
+    """
+
+    orders: NDArray[np.intp]
+    at: Callable[[int], DiagonalSystem]
+
+
+def reduce(
+    system: DiagonalSystem,
+    method: Method,
+    *,
+    order: int | None = None,
+    tolerance: float | None = None,
+    band_hz: tuple[float, float] = (0.0, 30.0),
+) -> Reduction:
+    """Reduce a stable system to `order` states, or to the fewest that keep the force error in the band.
+
+    method     "tbr": balanced truncation (Moore 1981; H-infinity bound: Enns 1984, Glover 1984).
+               "tbr-band": one-sided band-limited balanced truncation: the controllability Gramian limited to the band,
+               the whole observability Gramian, so that the reduced model is stable (Sreeram & Ghafoor 2005); no bound.
+               "modal": the modes of lowest frequency, whole, D unchanged.
+               "modal-static": the same, and the residual stiffness of the dropped modes added to D: exact statics.
+    order      number of real states; fewer where further ones are below round-off (the reduction says how many), and
+               for modal methods as many as the whole modes that fit in have
+    tolerance  largest over the band of |F - F_reduced| / |F|, a fraction, for every method
+    band_hz    (low, high), 0 <= low < high
+
+    Raises ReductionError where the system is not stable (nothing is reduced silently then), the order is too
+    small for the method, or the tolerance is not reached; ValueError for arguments out of range.
+    """
+    _check_arguments(method, order, tolerance, band_hz)
+    _check_stability(system)
+    singular_values: Array = np.zeros(0)
+    tail: Callable[[int], float] | None = None
+    if method == "tbr":
+        family, singular_values, tail = _balanced(system)
+    elif method == "tbr-band":
+        family, singular_values = _band_balanced(system, band_hz)
+    else:
+        family = _modal(system, keep_statics=method == "modal-static")
+    if order is not None:
+        chosen = _available(family.orders, order, method)
+        reduced = family.at(chosen)
+    else:
+        assert tolerance is not None  # _check_arguments has seen to it
+        reduced, chosen = _smallest(system, family, tolerance, band_hz, method)
+    if not reduced.spectral_abscissa < 0:
+        raise ReductionError(
+            f"{method} at order {chosen} has a spectral abscissa of {reduced.spectral_abscissa:.3g} 1/s, "
+            "expected below 0: choose another order"
+        )
+    return Reduction(method, reduced, singular_values, None if tail is None else tail(chosen))
+
+
+def _check_arguments(
+    method: str, order: int | None, tolerance: float | None, band_hz: tuple[float, float]
+) -> None:
+    if method not in METHODS:
+        raise ValueError(f"method = {method!r}: expected one of {', '.join(METHODS)}")
+    if (order is None) == (tolerance is None):
+        raise ValueError(f"order = {order} and tolerance = {tolerance}: expected exactly one of them")
+    if order is not None and order < 1:
+        raise ValueError(f"order = {order}: expected at least 1")
+    if tolerance is not None and not 0 < tolerance < math.inf:
+        raise ValueError(f"tolerance = {tolerance}: expected a number above 0")
+    if not 0 <= band_hz[0] < band_hz[1] < math.inf:
+        raise ValueError(f"band_hz = {band_hz}: expected (low, high) with 0 <= low < high")
+
+
+def _check_stability(system: DiagonalSystem) -> None:
+    abscissa = system.spectral_abscissa
+    if np.all(system.poles.real == 0):
+        raise ReductionError(
+            "the body is purely elastic: all its poles lie on the imaginary axis, so it has no Gramians and a "
+            "reduced model would ring for ever; give the material a Prony series"
+        )
+    if not abscissa < 0:
+        growing = int(np.count_nonzero(system.poles.real >= 0))
+        raise ReductionError(
+            f"the full model is not stable: {growing} of its {len(system.poles)} poles do not decay, spectral abscissa "
+            f"{abscissa:.3g} 1/s, expected below 0"
+        )
+
+
+def _balanced(system: DiagonalSystem) -> tuple[_Family, Array, Callable[[int], float]]:
+    """Balanced truncation by square roots of the Gramians (Tombs & Postlethwaite 1987)."""
+    form = real_form(system)
+    control = controllability_factor(system, _GRAMIAN_TOLERANCE)
+    if system.is_symmetric:
+        # Q = S P S: the Hankel matrix L^T S L is symmetric, and eigenvalues do for singular values.
+        observe = control
+        signed = form.signature[:, None] * control.factor
+        values, vectors = np.linalg.eigh(signed.T @ control.factor)
+        descending = np.argsort(np.abs(values))[::-1]
+        values, right = values[descending], vectors[:, descending]
+        left = right * np.where(values < 0, -1.0, 1.0)
+        sigma = np.abs(values)
+        observe_factor = signed
+    else:
+        observe = observability_factor(system, _GRAMIAN_TOLERANCE)
+        observe_factor = observe.factor
+        left, sigma, right_transposed = np.linalg.svd(observe_factor.T @ control.factor)
+        left, right = left[:, : len(sigma)], right_transposed[: len(sigma)].T
+    # With P = L L^T + R and Q likewise, the Hankel singular values of the whole differ from sigma by at most this in
+    # sum (Mirsky's inequality; nuclear norms of the missing blocks).
+    missing = (
+        math.sqrt(observe.trace * control.residual)
+        + math.sqrt(control.trace * observe.residual)
+        + math.sqrt(control.residual * observe.residual)
+    )
+
+    def tail(order: int) -> float:
+        return float(2 * (np.sum(sigma[order:]) + missing))
+
+    return _projected(system, form, control.factor, observe_factor, left, sigma, right), sigma, tail
+
+
+def _band_balanced(system: DiagonalSystem, band_hz: tuple[float, float]) -> tuple[_Family, Array]:
+    """One-sided band-limited balancing (Sreeram & Ghafoor 2005)."""
+    form = real_form(system)
+    band = (2 * math.pi * band_hz[0], 2 * math.pi * band_hz[1])
+    control = band_controllability_factor(system, band, _BAND_FREQUENCIES)
+    if system.is_symmetric:
+        observe = form.signature[:, None] * controllability_factor(system, _GRAMIAN_TOLERANCE).factor
+    else:
+        observe = observability_factor(system, _GRAMIAN_TOLERANCE).factor
+    left, sigma, right = np.linalg.svd(observe.T @ control, full_matrices=False)
+    return _projected(system, form, control, observe, left, sigma, right.T), sigma
+
+
+def _projected(
+    system: DiagonalSystem,
+    form: RealForm,
+    control: Array,
+    observe: Array,
+    left: Array,
+    sigma: Array,
+    right: Array,
+) -> _Family:
+    """Square-root projections W = observe left / sqrt(sigma), T = control right / sqrt(sigma), for any order."""
+    rank = int(np.count_nonzero(sigma > _RANK_TOLERANCE * sigma[0])) if len(sigma) else 0
+
+    def at(order: int) -> DiagonalSystem:
+        scale = 1 / np.sqrt(sigma[:order])
+        w, t = observe @ (left[:, :order] * scale), control @ (right[:, :order] * scale)
+        return diagonalise(w.T @ form.apply(t), w.T @ form.b, form.c @ t, system.d)
+
+    return _Family(np.arange(1, rank + 1), at)
+
+
+def _modal(system: DiagonalSystem, *, keep_statics: bool) -> _Family:
+    """The groups of lowest number, that is the relaxation of the static stiffness and the slowest modes."""
+    sizes = np.bincount(system.group, weights=np.where(system.is_pair, 2, 1)).astype(np.intp)
+    orders = np.unique(np.cumsum(sizes))
+    orders = orders[orders > 0]
+
+    def at(order: int) -> DiagonalSystem:
+        kept = np.isin(system.group, np.flatnonzero(np.cumsum(sizes) <= order))
+        reduced = system.take(kept)
+        if not keep_statics:
+            return reduced
+        d = system.d + system.static_gain() - reduced.static_gain()
+        return DiagonalSystem(reduced.poles, reduced.b, reduced.c, d, reduced.group)
+
+    return _Family(orders, at)
+
+
+def _available(orders: NDArray[np.intp], order: int, method: str) -> int:
+    """The largest order of the method up to the one asked for."""
+    if not len(orders) or order < orders[0]:
+        least = int(orders[0]) if len(orders) else 0
+        raise ReductionError(f"order = {order}: {method} needs at least {least} states here")
+    return int(orders[np.searchsorted(orders, order, side="right") - 1])
+
+
+def _smallest(
+    system: DiagonalSystem,
+    family: _Family,
+    tolerance: float,
+    band_hz: tuple[float, float],
+    method: str,
+) -> tuple[DiagonalSystem, int]:
+    """The first stable system within the tolerance: up a ladder of orders, then all orders on its last rung.
+
+    The error does not fall monotonously with the order, so bisection would not do.
+    """
+    omega = band_frequencies((system,), band_hz)
+    full = system.transfer(1j * omega)
+    best = (math.inf, 0)
+
+    def attempt(order: int) -> DiagonalSystem | None:
+        nonlocal best
+        reduced = family.at(order)
+        # Between the samples only the reduced model's own resonances can stand out.
+        own = np.setdiff1d(band_frequencies((reduced,), band_hz), omega)
+        error = float(np.max(relative_errors(full, reduced.transfer(1j * omega))))
+        if error <= tolerance and len(own):
+            more = relative_errors(system.transfer(1j * own), reduced.transfer(1j * own))
+            error = max(error, float(np.max(more)))
+        if reduced.spectral_abscissa < 0:
+            best = min(best, (error, order))
+            if error <= tolerance:
+                return reduced
+        return None
+
+    below = -1
+    rung = 0
+    while True:
+        if attempt(int(family.orders[rung])) is not None:
+            for i in range(below + 1, rung + 1):
+                reduced = attempt(int(family.orders[i]))
+                if reduced is not None:
+                    return reduced, int(family.orders[i])
+        if rung == len(family.orders) - 1:
+            raise ReductionError(
+                f"tolerance = {tolerance:g}: {method} reaches {best[0]:.2g} in {band_hz[0]:g}-{band_hz[1]:g} Hz at best, "
+                f"at order {best[1]}"
+            )
+        below, rung = rung, min(max(rung + 1, math.ceil(1.25 * rung)), len(family.orders) - 1)

@@ -1,0 +1,66 @@
+"""How much energy a discrete force response can give out over closed pokes.
+
+A poke u_k = Re(a e^{j theta k}), theta = omega T, returns to where it began after 2 pi / theta samples. A device that
+renders the force samples does the work of the trapezoidal sum of (F_k + F_{k+1})/2 . (u_{k+1} - u_k) on the tissue. With
+F_k = Re(G a e^{j theta k}) the mean of one summand is 1/4 Re[(G a)^H a (1 + e^{-j theta})(e^{j theta} - 1)], and as the
+product of the brackets is 2j sin(theta), the work of one closed poke is
+
+    W = pi sin(theta)/theta  a^H (G - G^H)/(2j) a.
+
+So the tissue dissipates at theta where the Hermitian matrix (G - G^H)/2j is positive semidefinite; the weight
+sin(theta)/theta is positive below the Nyquist frequency.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.diagonal_system import DiagonalSystem
+from palpate.reduction.frequencies import maximum, spectral_norms
+
+Array = NDArray[np.float64]
+
+
+def passivity_margin(discrete: DiagonalSystem) -> float:
+    """Smallest eigenvalue of (G - G^H)/2j over all frequencies, over |G(1)|, the static stiffness.
+
+    discrete  the discrete response G(z), z = e^{j omega T}. Zero or above (but for round-off): no closed sinusoidal
+              poke gets energy out.
+    """
+    _, worst = maximum(lambda theta: -_least_dissipation(discrete, theta)[0], _angles(discrete))
+    return -worst / float(spectral_norms(discrete.transfer(np.ones(1, dtype=np.complex128)))[0])
+
+
+def largest_energy_out(discrete: DiagonalSystem, amplitude_m: float) -> float:
+    """Largest work, J, that one closed sinusoidal poke of |a| = amplitude_m gets out; 0 where none does."""
+
+    def energy(theta: Array) -> Array:
+        return -np.pi * np.sinc(theta / np.pi) * _least_dissipation(discrete, theta)[0]
+
+    return max(0.0, maximum(energy, _angles(discrete))[1]) * amplitude_m**2
+
+
+def worst_poke(discrete: DiagonalSystem) -> tuple[float, NDArray[np.complex128]]:
+    """(theta, a): angle per sample and unit complex amplitudes (n_inputs,) of the poke that gets most energy out."""
+
+    def energy(theta: Array) -> Array:
+        return -np.sinc(theta / np.pi) * _least_dissipation(discrete, theta)[0]
+
+    theta, _ = maximum(energy, _angles(discrete))
+    return theta, _least_dissipation(discrete, np.array([theta]))[1][0]
+
+
+def _least_dissipation(discrete: DiagonalSystem, theta: Array) -> tuple[Array, NDArray[np.complex128]]:
+    """Smallest eigenvalue (n,) of (G - G^H)/2j at the angles theta (n,) and its eigenvector (n, n_inputs)."""
+    g = discrete.transfer(np.exp(1j * theta))
+    values, vectors = np.linalg.eigh((g - np.conj(np.swapaxes(g, 1, 2))) / 2j)
+    return values[:, 0], vectors[:, :, 0]
+
+
+def _angles(discrete: DiagonalSystem) -> Array:
+    """(n,), ascending in 0..pi: statics, 1,000 points even in the logarithm, 200 even ones, and all resonances."""
+    slowest = float(np.min(np.abs(1 - discrete.poles), initial=1.0))
+    resonances = np.angle(discrete.poles[discrete.is_pair])
+    grid = np.geomspace(min(slowest / 100, 1e-3), np.pi, 1000)
+    return np.unique(np.concatenate([[0.0], grid, np.linspace(0, np.pi, 200), resonances]))
