@@ -13,6 +13,13 @@ CHUNK = 64
 REORDER = {"reassoc", "contract", "nsz"}
 
 
+@njit(cache=True)
+def quartic_spline(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """W(s) = 1 - 6 s² + 8 s³ - 3 s⁴ for 0 <= s <= 1, Eq. 21; s any shape."""
+    t = 1.0 - s
+    return t * t * t * (1.0 + 3.0 * s)
+
+
 @njit(parallel=True, cache=True, fastmath=REORDER)
 def evaluate(
     points: NDArray[np.float64],
@@ -80,9 +87,9 @@ def evaluate(
                     y = (nodes[node, a] - points[i, a]) / scale
                     basis[1 + a, j] = y
                     squared += y * y
-                s = np.sqrt(squared) * ratio
-                t = max(1.0 - s, 0.0)
-                weights[0, j] = t * t * t * (1.0 + 3.0 * s)  # 1 - 6 s² + 8 s³ - 3 s⁴
+                s = min(np.sqrt(squared) * ratio, 1.0)
+                t = 1.0 - s
+                weights[0, j] = quartic_spline(s)
                 if derivatives >= 1:
                     slope = -12.0 * t * t * ratio * ratio  # W'(s) / s
                     for a in range(dim):

@@ -1,0 +1,67 @@
+"""Whether the modes of an assembled model decay, and how much damping would make them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.material import PronySeries
+from palpate.system import ElasticModes
+
+
+@dataclass(frozen=True)
+class Stability:
+    """What to know about a discretisation before reducing it.
+
+    growing_modes           number of modes with a pole right of the imaginary axis, beyond round-off
+    spectral_abscissa_per_s largest real part of all poles, 1/s
+    largest_imaginary_part  largest |Im mu| / |mu| of the squared frequencies mu; 0 for a symmetric discretisation
+    curing_damping_per_s    smallest c, 1/s, with which rho (u'' + c u') lets every elastic mode decay,
+                            infinite when one diverges statically (Re mu <= 0)
+    """
+
+    growing_modes: int
+    spectral_abscissa_per_s: float
+    largest_imaginary_part: float
+    curing_damping_per_s: float
+
+
+def stability(modes: ElasticModes, prony: PronySeries) -> Stability:
+    """Judge the modes with the material's memory. s² + c s + mu has both roots on the left when c² Re mu > (Im mu)²."""
+    mu = np.asarray(modes.squared_frequencies, dtype=np.complex128)
+    size = np.abs(mu)
+    round_off = np.finfo(np.float64).eps * size.max()
+    real = _poles(mu, prony).real.max(axis=1)
+    moving = size > 1e3 * round_off  # rigid modes are zero to round-off: neither growing nor curable
+    ratio = np.abs(mu.imag[moving]) / size[moving]
+    complex_pairs = np.abs(mu.imag) > 1e3 * round_off
+    damping = np.where(
+        mu.real > 0, np.abs(mu.imag) / np.sqrt(np.maximum(mu.real, np.finfo(np.float64).tiny)), np.inf
+    )
+    return Stability(
+        growing_modes=int(np.sum(real[moving] > 1e-9 * np.sqrt(size[moving]))),
+        spectral_abscissa_per_s=float(real.max()),
+        largest_imaginary_part=float(ratio.max(initial=0.0)),
+        curing_damping_per_s=float(damping[complex_pairs | (moving & (mu.real <= 0))].max(initial=0.0)),
+    )
+
+
+def _poles(squared_frequencies: NDArray[np.complex128], prony: PronySeries) -> NDArray[np.complex128]:
+    """(n_modes, n_terms + 2), 1/s: the roots of s² + mu h(s) = 0 for every mu of squared_frequencies (n_modes,), (rad/s)².
+
+    Eigenvalues of the mode's own states u, v / |mu|^½ and the memories z_j: exact, no polynomial in s is formed.
+    """
+    mu = squared_frequencies
+    omega = np.sqrt(np.abs(mu))
+    direction = np.divide(mu, omega, out=np.zeros_like(mu), where=omega > 0)
+    n_terms = len(prony.gamma)
+    a = np.zeros((len(mu), n_terms + 2, n_terms + 2), dtype=np.complex128)
+    a[:, 0, 1] = omega
+    a[:, 1, 0] = -direction
+    for j, (gamma, tau) in enumerate(zip(prony.gamma, prony.tau_s, strict=True), start=2):
+        a[:, 1, j] = -gamma * direction
+        a[:, j, 1] = omega
+        a[:, j, j] = -1 / tau
+    return np.linalg.eigvals(a).astype(np.complex128)
