@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import zenoh
@@ -48,5 +49,10 @@ def _listening_peer(endpoint: str) -> zenoh.Config:
 
 
 def _first_cause(error: zenoh.ZError) -> str:
-    """Zenoh's own words without the places in its source, which follow each cause."""
-    return str(error).split(" at /", 1)[0].strip().rstrip(".") or "refused"
+    """Zenoh's own words on one line: without the places in its source, or the drawing around a syntax error."""
+    text = str(error)
+    syntax = re.search(r"--> (\d+):(\d+).*= (expected .*)", text, re.DOTALL)
+    if syntax:
+        line, column, expected = syntax.groups()
+        return f"line {line}, column {column}: {' '.join(expected.split())}"
+    return " ".join(text.split(" at /", 1)[0].split()).rstrip(".") or "refused"

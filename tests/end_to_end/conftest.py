@@ -1,0 +1,195 @@
+"""A real server in a process of its own, on loopback and a free port, ended whatever happens."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import msgpack
+import pytest
+import zenoh
+
+from palpate.model import ReducedModel, save_model
+
+EXAMPLES = Path(__file__).parents[2] / "client_examples"
+START_S = 60.0  # the first start compiles
+SESSION = "test"
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@dataclass
+class ServedModel:
+    """A server that is running."""
+
+    process: subprocess.Popen[str]
+    endpoint: str
+    model: ReducedModel
+
+    def stop(self, number: int = signal.SIGTERM) -> int:
+        self.process.send_signal(number)
+        return self.process.wait(20)
+
+
+@dataclass
+class RawClient:
+    """A client that can misbehave: it sends any bytes, and keeps whatever comes."""
+
+    endpoint: str
+    name: str = field(default_factory=lambda: f"test-{uuid.uuid4().hex[:8]}")
+    forces: list[dict[str, Any]] = field(default_factory=list)
+    statuses: list[dict[str, Any]] = field(default_factory=list)
+    sequence: int = 0
+
+    def __enter__(self) -> RawClient:
+        config = zenoh.Config()
+        for key, value in {
+            "mode": "peer",
+            "listen/endpoints": [],
+            "connect/endpoints": [self.endpoint],
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+        }.items():
+            config.insert_json5(key, json.dumps(value))
+        self.session = zenoh.open(config)
+        self.token = self.session.liveliness().declare_token(f"palpate/{SESSION}/client/{self.name}")
+        self._subscribers = [
+            self.session.declare_subscriber(
+                f"palpate/{SESSION}/{key}", lambda s, to=to: to.append(msgpack.unpackb(s.payload.to_bytes()))
+            )
+            for key, to in (("force", self.forces), ("status", self.statuses))
+        ]
+        wait_for(lambda: self.forces and self.statuses, "forces and statuses")
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self.session.close()
+
+    def query(self, key: str, request: object = None) -> tuple[bool, dict[str, Any]]:
+        """Whether it was granted, and the answer."""
+        payload = None if request is None else msgpack.packb(request)
+        for reply in self.session.get(f"palpate/{SESSION}/{key}", payload=payload, timeout=5.0):
+            result = reply.ok or reply.err
+            assert result is not None
+            return reply.ok is not None, msgpack.unpackb(result.payload.to_bytes())
+        raise AssertionError(f"no answer to {key}")
+
+    def acquire(self, *contacts: str) -> tuple[bool, dict[str, Any]]:
+        return self.query("control/acquire", {"client": self.name, "contacts": list(contacts)})
+
+    def put(self, payload: bytes) -> None:
+        self.session.put(
+            f"palpate/{SESSION}/command/{self.name}",
+            payload,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+
+    def command(self, displacement_m: dict[str, list[float]], sequence: int | None = None) -> int:
+        if sequence is None:
+            self.sequence += 1
+            sequence = self.sequence
+        message = {
+            "sequence": sequence,
+            "client_time_ns": time.monotonic_ns(),
+            "displacement_m": displacement_m,
+        }
+        self.put(msgpack.packb(message))
+        return sequence
+
+    def next_status(self) -> dict[str, Any]:
+        """The second status from now: the first may have been made before."""
+        count = len(self.statuses)
+        wait_for(lambda: len(self.statuses) >= count + 2, "a status")
+        return self.statuses[-1]
+
+
+def wait_for(condition: Callable[[], object], what: str, seconds: float = 20.0) -> None:
+    give_up = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < give_up, f"waited {seconds} s for {what}"
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def serve(
+    tmp_path: Path, make_spring_mass_model: Callable[..., ReducedModel]
+) -> Iterator[Callable[..., ServedModel]]:
+    processes: list[subprocess.Popen[str]] = []
+
+    def start(*options: str, n_contacts: int = 1) -> ServedModel:
+        model = make_spring_mass_model(n_contacts, 20)
+        path = tmp_path / f"model{n_contacts}.npz"
+        save_model(model, path)
+        endpoint = free_endpoint()
+        process = subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "palpate_server",
+                str(path),
+                "--listen",
+                endpoint,
+                "--session",
+                SESSION,
+                *options,
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        processes.append(process)
+        assert process.stdout is not None
+        give_up = time.monotonic() + START_S
+        for line in process.stdout:
+            if line.startswith("serving"):
+                return ServedModel(process, endpoint, model)
+            assert time.monotonic() < give_up
+        raise AssertionError("the server did not start")
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.wait()
+        if process.stdout:
+            process.stdout.close()
+
+
+@pytest.fixture
+def run_example() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    processes: list[subprocess.Popen[str]] = []
+
+    def run(script: str, endpoint: str, *options: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, str(EXAMPLES / script), "--connect", endpoint, "--session", SESSION, *options],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        processes.append(process)
+        return process
+
+    yield run
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def connect() -> type[RawClient]:
+    return RawClient

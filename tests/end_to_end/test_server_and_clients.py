@@ -1,0 +1,359 @@
+"""Server and clients as a user runs them: separate processes, real sockets, real time."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+
+from palpate_server.safety import Flags
+
+LIMITS_MET = int(
+    Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED | Flags.SLEW_LIMITED | Flags.FORCE_CLAMPED | Flags.FAULT
+)
+
+
+def finish(process: subprocess.Popen[str], seconds: float = 60.0) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=seconds)
+    return process.returncode, out, err
+
+
+def wait_until(condition: Callable[[], Any], seconds: float = 20.0) -> None:
+    give_up = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < give_up
+        time.sleep(0.005)
+
+
+def test_forces_through_the_wire_are_the_models_response_to_the_applied_displacements(
+    serve: Callable[..., Any], run_example: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serve("--max-force-n", "1000", "--max-force-rate-n-per-s", "1e9")
+    recording = tmp_path / "ticks.csv"
+    client = run_example(
+        "headless_client.py", served.endpoint, "--duration-s", "3", "--json", "--record", str(recording)
+    )
+    code, out, err = finish(client)
+    summary = json.loads(out)
+    assert code == 0, err
+    assert summary["contract_broken"] == []
+    assert summary["commands_answered"] > 0
+    assert summary["round_trip_s"]["p50"] > 0
+
+    with recording.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    ticks = np.array([int(row["tick"]) for row in rows])
+    assert np.all(np.diff(ticks) == 1)  # nothing was lost on loopback, so the response can be followed
+    flags = np.array([int(row["tip.flags"]) for row in rows])
+    assert not np.any(flags & LIMITS_MET)
+    scale = np.array([float(row["tip.force_scale"]) for row in rows])
+    assert scale.max() == 1
+    applied = np.array([[float(row[f"tip.displacement_{axis}_m"]) for axis in "xyz"] for row in rows])
+    force = np.array([[float(row[f"tip.force_{axis}_n"]) for axis in "xyz"] for row in rows])
+    assert not np.any(applied[0])  # heard from before the first displacement: the model was at rest
+    assert np.abs(applied).max() == pytest.approx(0.005, rel=1e-3)
+
+    system = served.model.discrete
+    state, a = np.zeros(system.order), system.dense_a()
+    expected = np.empty_like(force)
+    for k, u in enumerate(applied):
+        expected[k] = system.c @ state + system.d @ u
+        state = a @ state + system.b @ u
+    np.testing.assert_allclose(force, scale[:, None] * expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_device_bridge_holds_the_contract(serve: Callable[..., Any], run_example: Callable[..., Any]) -> None:
+    served = serve()
+    code, out, err = finish(run_example("device_bridge.py", served.endpoint, "--duration-s", "2"))
+    assert code == 0, err
+    assert "largest force" in out
+
+
+def test_force_is_zero_within_a_tenth_of_a_second_after_the_client_is_killed(
+    serve: Callable[..., Any], run_example: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve()
+    with connect(served.endpoint) as observer:
+        client = run_example(
+            "headless_client.py", served.endpoint, "--duration-s", "60", "--frequency-hz", "0.1"
+        )
+        wait_until(lambda: observer.forces[-1]["force_scale"][0] == 1)
+        time.sleep(0.2)
+        killed_ns = time.monotonic_ns()
+        client.kill()
+        wait_until(lambda: observer.forces[-1]["flags"][0] & Flags.STALE)
+        forces = list(observer.forces)
+        # One machine, one monotonic clock: the server's tick times are comparable with the time of the kill.
+        after = [m for m in forces if m["server_time_ns"] >= killed_ns]
+        assert any(np.linalg.norm(m["force_n"][0]) > 0 for m in forces)
+        zero = next(m for m in after if m["force_n"][0] == [0.0, 0.0, 0.0] or not np.any(m["force_n"][0]))
+        assert zero["server_time_ns"] - killed_ns < 100e6
+        assert not any(np.any(m["force_n"][0]) for m in after[after.index(zero) :])
+        wait_until(lambda: observer.statuses[-1]["contacts"]["tip"]["holder"] is None)
+        granted, _ = observer.acquire("tip")
+        assert granted
+
+
+def test_a_paused_client_is_faded_out_and_softly_in_again(
+    serve: Callable[..., Any], run_example: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve()
+    with connect(served.endpoint) as observer:
+        client = run_example(
+            "headless_client.py", served.endpoint, "--duration-s", "60", "--frequency-hz", "0.5"
+        )
+        wait_until(lambda: observer.forces[-1]["force_scale"][0] == 1)
+        client.send_signal(signal.SIGSTOP)
+        wait_until(lambda: observer.forces[-1]["flags"][0] & Flags.STALE)
+        first = len(observer.forces)
+        client.send_signal(signal.SIGCONT)
+        wait_until(lambda: observer.forces[-1]["force_scale"][0] == 1)
+        messages = observer.forces[first - 1 :]
+        changes = np.diff([m["force_n"][0] for m in messages], axis=0)
+        assert np.linalg.norm(changes, axis=1).max() <= 2.0 + 1e-9  # the default 2000 N/s
+        scale_changes = np.diff([m["force_scale"][0] for m in messages])
+        assert scale_changes.max() <= 1e-3 / 0.2 + 1e-9
+
+
+def test_a_killed_server_is_named_by_the_client_which_fails(
+    serve: Callable[..., Any], run_example: Callable[..., Any]
+) -> None:
+    served = serve()
+    client = run_example("headless_client.py", served.endpoint, "--duration-s", "60")
+    time.sleep(2.0)
+    assert client.poll() is None
+    served.process.kill()
+    code, _, err = finish(client, 20)
+    assert code == 1
+    assert "the server is" in err
+    assert "Traceback" not in err
+
+
+def test_a_client_without_a_server_says_so(run_example: Callable[..., Any]) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    code, _, err = finish(run_example("headless_client.py", endpoint, "--duration-s", "1"), 30)
+    assert code == 2
+    assert "palpate client:" in err
+    assert "Traceback" not in err
+
+
+def malformed_payloads(count: int) -> list[bytes]:
+    """Every kind of wrong, from one seed: random, truncated, wrong type, wrong shape, not finite, huge."""
+    generator = random.Random(0)
+    good = {"sequence": 1, "client_time_ns": 1, "displacement_m": {"tip": [0.0, 0.0, 0.0]}}
+    whole = msgpack.packb(good)
+    kinds: list[Callable[[], bytes]] = [
+        lambda: generator.randbytes(generator.randrange(200)),
+        lambda: whole[: generator.randrange(len(whole))],
+        lambda: msgpack.packb(good | {"sequence": "one"}),
+        lambda: msgpack.packb(good | {"displacement_m": [1, 2]}),
+        lambda: msgpack.packb(good | {"displacement_m": {"tip": [0.0] * generator.randrange(3)}}),
+        lambda: msgpack.packb(good | {"displacement_m": {"tip": [float("nan"), 0.0, 0.0]}}),
+        lambda: msgpack.packb(good | {"displacement_m": {"tip": [1e308, 1e308, float("inf")]}}),
+        lambda: msgpack.packb(good | {"displacement_m": {generator.randbytes(3).hex(): [0.0, 0.0, 0.0]}}),
+        lambda: bytes(5000),
+        lambda: msgpack.packb(generator.randrange(10**9)),
+    ]
+    return [kinds[i % len(kinds)]() for i in range(count)]
+
+
+def test_ten_thousand_malformed_messages_leave_the_server_ticking(
+    serve: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve()
+    with connect(served.endpoint) as client:
+        granted, _ = client.acquire("tip")
+        assert granted
+        payloads = malformed_payloads(10_000)
+        before = client.next_status()
+        for payload in payloads:
+            client.put(payload)
+        client.put(bytes(10_000_000))
+
+        def counted(status: dict[str, Any]) -> int:
+            return sum(status["refused"].values()) + sum(status["malformed"].values())
+
+        wait_until(lambda: counted(client.statuses[-1]) - counted(before) == len(payloads) + 1, 60)
+        after = client.next_status()
+        assert after["accepted"] == before["accepted"]
+        assert after["malformed"]["too_large"] == 1001
+        assert after["refused"]["not_finite"] == 2000
+        assert after["faults"] == 0
+        assert after["ticks"] > before["ticks"]
+
+        sequence = client.command({"tip": [0.0, 0.0, -1e-3]})
+        wait_until(lambda: client.forces[-1]["sequence"][0] == sequence)
+
+
+def test_old_sequences_and_others_contacts_are_refused(
+    serve: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve(n_contacts=2)
+    with connect(served.endpoint) as first, connect(served.endpoint) as second:
+        assert first.acquire("tip")[0]
+        granted, refusal = second.acquire("tip1", "tip")
+        assert not granted
+        assert refusal["reason"] == "held"
+        assert second.acquire("tip1")[0]
+        first.command({"tip": [0.0, 0.0, 0.0]}, sequence=5)
+        first.command({"tip": [0.0, 0.0, 1e-3]}, sequence=5)
+        first.command({"tip": [0.0, 0.0, 1e-3]}, sequence=4)
+        second.command({"tip": [0.0, 0.0, 1e-3]}, sequence=6)
+        second.command({"nothing": [0.0, 0.0, 1e-3]}, sequence=7)
+        wait_until(lambda: first.statuses[-1]["refused"]["unknown_contact"] == 1)
+        wait_until(lambda: sum(first.statuses[-1]["refused"].values()) == 4)
+        status = first.next_status()
+        assert status["accepted"] == 1
+        assert status["refused"]["old_sequence"] == 2
+        assert status["refused"]["not_holder"] == 1
+        assert first.query("control/release", {"client": first.name}) == (True, {"contacts": ["tip"]})
+        assert second.acquire("tip")[0]
+
+
+@pytest.mark.parametrize(
+    ("action", "request_", "reason"),
+    [
+        ("acquire", {"client": "nobody", "contacts": ["tip"]}, "not_alive"),
+        ("acquire", {"client": "a/b", "contacts": ["tip"]}, "wrong_type"),
+        ("acquire", {"client": "nobody", "contacts": "tip"}, "wrong_type"),
+        ("explode", {"client": "nobody"}, "unknown_action"),
+    ],
+)
+def test_every_refusal_carries_its_reason(
+    serve: Callable[..., Any], connect: Callable[..., Any], action: str, request_: object, reason: str
+) -> None:
+    served = serve()
+    with connect(served.endpoint) as client:
+        granted, refusal = client.query(f"control/{action}", request_)
+        assert not granted
+        assert refusal["reason"] == reason
+        assert refusal["message"]
+
+
+def test_describe_and_geometry_say_what_the_model_is(
+    serve: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve("--max-force-n", "3.5")
+    surface = served.model.surface
+    with connect(served.endpoint) as client:
+        _, description = client.query("describe")
+        assert description["schema_version"] == 1
+        assert description["limits"]["max_force_n"] == 3.5
+        assert [contact["name"] for contact in description["contacts"]] == ["tip"]
+        assert description["model"]["evidence"]["band_hz"] == [0.0, 30.0]
+        _, geometry = client.query("geometry")
+        vertices = np.frombuffer(geometry["vertices_m"], "<f4").reshape(-1, 3)
+        np.testing.assert_array_equal(vertices, surface.vertices.astype(np.float32))
+        triangles = np.frombuffer(geometry["triangles"], "<i4").reshape(-1, 3)
+        np.testing.assert_array_equal(triangles, surface.triangles)
+
+        surfaces: list[dict[str, Any]] = []
+        subscriber = client.session.declare_subscriber(
+            "palpate/test/surface", lambda s: surfaces.append(msgpack.unpackb(s.payload.to_bytes()))
+        )
+        wait_until(lambda: len(surfaces) >= 5)
+        subscriber.undeclare()
+        moved = np.frombuffer(surfaces[-1]["displacement_m"], "<f4")
+        np.testing.assert_array_equal(
+            moved, np.zeros(3 * len(surface.vertices), np.float32)
+        )  # nobody pokes it
+        ticks = [message["tick"] for message in surfaces]
+        assert ticks == sorted(set(ticks))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_the_server_cleanly_within_a_second(
+    serve: Callable[..., Any], connect: Callable[..., Any], number: int
+) -> None:
+    served = serve()
+    with connect(served.endpoint) as client:
+        gone: list[object] = []
+        client.session.liveliness().declare_subscriber("palpate/test/server", gone.append)
+        assert client.acquire("tip")[0]
+        asked = time.monotonic()
+        assert served.stop(number) == 0
+        assert time.monotonic() - asked < 1.0
+        wait_until(lambda: gone)
+        assert client.statuses[-1]["state"] == "stopping"
+
+
+def run_server(*arguments: str) -> tuple[int, str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "palpate_server", *arguments], capture_output=True, text=True, timeout=60
+    )
+    return done.returncode, done.stderr
+
+
+def test_a_server_that_cannot_start_says_why_in_one_line(serve: Callable[..., Any], tmp_path: Path) -> None:
+    served = serve()
+    model = next(tmp_path.glob("*.npz"))
+    damaged = tmp_path / "damaged.npz"
+    damaged.write_bytes(model.read_bytes()[:1000])
+    unreadable = tmp_path / "broken.json5"
+    unreadable.write_text("{ mode: ")
+    for arguments, expected in (
+        ((str(model), "--listen", served.endpoint), "in use"),
+        ((str(model), "--listen", "carrier-pigeon/1"), "carrier-pigeon/1"),
+        ((str(damaged),), "damaged"),
+        ((str(tmp_path / "missing.npz"),), "no such model file"),
+        ((str(model), "--zenoh-config", str(unreadable)), "broken.json5"),
+        ((str(model), "--zenoh-config", str(tmp_path / "missing.json5")), "no such file"),
+        ((str(model), "--session", "a/b"), "a/b"),
+    ):
+        code, err = run_server(*arguments)
+        assert code == 2
+        assert expected in err
+        assert len(err.strip().splitlines()) == 1
+
+
+def test_a_zenoh_configuration_is_used_as_it_is(
+    serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serve()
+    served.stop()
+    config = tmp_path / "zenoh.json5"
+    config.write_text(
+        f'{{ mode: "peer", listen: {{ endpoints: ["{served.endpoint}"] }},'
+        " scouting: { multicast: { enabled: false }, gossip: { enabled: false } } }"
+    )
+    model = next(tmp_path.glob("*.npz"))
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "palpate_server",
+            str(model),
+            "--zenoh-config",
+            str(config),
+            "--session",
+            "test",
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ,
+    )
+    try:
+        assert process.stdout is not None
+        assert "serving" in process.stdout.readline()
+        with connect(served.endpoint) as client:
+            assert client.query("describe")[0]
+        process.terminate()
+        assert process.wait(20) == 0
+    finally:
+        process.kill()
+        process.communicate()
