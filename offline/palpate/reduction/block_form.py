@@ -32,6 +32,8 @@ def diagonalise(
     upper = upper[np.argsort(np.abs(poles[upper]), kind="stable")]
     rows = np.linalg.solve(vectors, b.astype(np.complex128))[upper]
     columns = (c @ vectors)[:, upper]
+    on_axis = poles[upper].imag == 0  # there the eigenvectors are real, the solution has complex round-off
+    rows[on_axis], columns[:, on_axis] = rows[on_axis].real, columns[:, on_axis].real
     row_norm, column_norm = np.linalg.norm(rows, axis=1), np.linalg.norm(columns, axis=0)
     driven = (row_norm > 0) & (column_norm > 0)
     scale = np.sqrt(np.where(driven, column_norm, 1) / np.where(driven, row_norm, 1))

@@ -71,8 +71,8 @@ def real_form(system: DiagonalSystem) -> RealForm:
     signature = np.ones(n)
     signature[pair + 1] = -1.0
     # Of a real pole the rows are real or imaginary (the square root of a real residue): j times j makes the sign.
-    imaginary = np.any(system.b.imag[~is_pair] != 0, axis=1)
-    signature[real] = np.where(imaginary, -1.0, 1.0)
+    rows = system.b[~is_pair]
+    signature[real] = np.where(np.sum(rows.imag**2, axis=1) > np.sum(rows.real**2, axis=1), -1.0, 1.0)
     b = _in_real_coordinates(system, system.b)
     c = (_in_real_coordinates(system, system.c.T) * signature[:, None]).T
     return RealForm(decay, rotation, partner, b, c, signature)
