@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.geometry.cloud import INTERIOR, NodeCloud, TriangleSurface
-from palpate.geometry.sampling import Samples, closest_point, sample_elements, sample_inside
+from palpate.geometry.sampling import Samples, closest_point, depth_inside, sample_elements, sample_inside
 from palpate.geometry.sharp_edges import sharp_edges
 from palpate.geometry.spacing import Refinement, SpacingField
 from palpate.geometry.surface import check_surface, enclosed_volume, triangle_normals
@@ -57,8 +57,8 @@ def fill_surface(
     field = SpacingField(spacing_m, refinements)
     boundary = _boundary_nodes(surface, field, rng)
 
-    samples, depth = sample_inside(surface, field, _PLACING)
-    room = depth > 0.5 * samples.spacing
+    samples = sample_inside(surface, field, _PLACING)
+    room = depth_inside(samples.points, surface) > 0.5 * samples.spacing
     points = _place(boundary, samples, room, 3, lambda p: p, field, rng)
     n_boundary = len(boundary)
     if len(points) == n_boundary:
@@ -68,7 +68,7 @@ def fill_surface(
 
     areas, normals = np.zeros(len(points)), np.zeros_like(points)
     areas[:n_boundary], normals[:n_boundary] = _areas_and_normals(boundary, surface, field)
-    samples, _ = sample_inside(surface, field, _MEASURING)
+    samples = sample_inside(surface, field, _MEASURING)
     return NodeCloud(
         points=points,
         normals=normals,

@@ -86,28 +86,32 @@ def sample_elements(
     return Samples(corners.mean(axis=1), measures, h), parent
 
 
-def sample_inside(surface: TriangleSurface, field: SpacingField, fineness: float) -> tuple[Samples, Array]:
-    """Midpoints of octree cells of size fineness * h at most, and their depth below the surface in m, (n_samples,).
+def sample_inside(surface: TriangleSurface, field: SpacingField, fineness: float) -> Samples:
+    """Midpoints of octree cells of size fineness * h at most, there.
 
-    A cell that the surface crosses counts with the part of it below the plane at its midpoint's distance; its
-    midpoint may lie outside (negative depth).
+    A cell that the surface crosses counts with the part of it below the plane at its midpoint's distance from the
+    surface; its midpoint may lie outside.
     """
     low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
-    size = fineness * field.spacing_m
+    size = 8 * fineness * field.spacing_m
     counts = np.ceil((high - low) / size).astype(int)
     index = np.indices(tuple(int(n) for n in counts)).reshape(3, -1).T
     centres = (low + high) / 2 + (index - (counts - 1) / 2) * size
     octants = (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) / 2
-    done: list[tuple[Array, Array, Array, Array]] = []
+    depth = np.full(len(centres), -np.inf)
+    done: list[tuple[Array, Array, Array]] = []
     while len(centres):
-        depth = depth_inside(centres, surface)
-        near = depth > -size * np.sqrt(3) / 2
+        # From its parent a cell knows a depth that it has at least: only those near the surface need their own.
+        reach = size * np.sqrt(3) / 2
+        unsure = depth < reach
+        depth[unsure] = depth_inside(centres[unsure], surface)
+        near = depth > -reach
         centres, depth, h = centres[near], depth[near], field(centres[near])
         small = size <= fineness * h * (1 + 1e-9)
         share = np.clip(0.5 + depth / size, 0.0, 1.0)
         leaf = small & (share > 0)
-        done.append((centres[leaf], share[leaf] * size**3, h[leaf], depth[leaf]))
+        done.append((centres[leaf], share[leaf] * size**3, h[leaf]))
         centres = (centres[~small, None, :] + size * octants).reshape(-1, 3)
+        depth = np.repeat(depth[~small] - reach / 2, 8)
         size /= 2
-    points, volumes, spacing, depths = (np.concatenate(column) for column in zip(*done, strict=True))
-    return Samples(points, volumes, spacing), depths
+    return Samples(*(np.concatenate(column) for column in zip(*done, strict=True)))
