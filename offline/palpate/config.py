@@ -158,6 +158,7 @@ class ReductionTable(_Table):
     )
     band_hz: tuple[float, float] = (0.0, 30.0)
     period_s: float = Field(default=1e-3, ge=1e-4, le=1e-1)
+    sampling: Literal["bilinear", "first-order-hold"] = "bilinear"
 
     @model_validator(mode="after")
     def _one_stop(self) -> ReductionTable:

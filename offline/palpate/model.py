@@ -115,7 +115,9 @@ class Surface:
 class Evidence:
     """How good the reduced model is, measured against the full one. Relative errors are fractions.
 
-    error_in_band          largest over the band of |F_full - F_reduced| / |F_full| (2-norms, at each frequency)
+    error_in_band          largest over the band of |F_full - F| / |F_full| (2-norms, at each frequency), F being the
+                           discrete model that runs: reduction and sampling together
+    error_in_band_continuous  the same of the reduced model before it is sampled: the reduction alone
     error_static           the same at 0 Hz
     error_hinf             largest over all frequencies of |F_full - F_reduced|, over the largest |F_full|
     error_bound            a-priori bound in the norm of error_hinf, or None where the method has none
@@ -132,6 +134,7 @@ class Evidence:
     """
 
     error_in_band: float
+    error_in_band_continuous: float
     error_static: float
     error_hinf: float
     error_bound: float | None
@@ -151,7 +154,7 @@ class ReducedModel:
     """All that the server needs to run a body, and all that a person needs to trust it.
 
     continuous  the reduced model dx/dt = A x + B u, F = C x + D u (u displacement in m, F force in N)
-    discrete    its first-order-hold discretisation at period_s in the form that runs:
+    discrete    the same sampled at period_s, in the form that runs:
                 F = C xi + D u, then xi+ = A xi + B u with the newest sample u
     full        the model that was reduced; nothing at run time needs it
     static_stiffness (n_outputs, n_inputs), N/m, of the full model; instant stiffness is continuous.d

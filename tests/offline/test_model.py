@@ -56,6 +56,7 @@ def small_model() -> ReducedModel:
         ),
         evidence=Evidence(
             error_in_band=0.01,
+            error_in_band_continuous=0.009,
             error_static=0.001,
             error_hinf=0.02,
             error_bound=None,

@@ -1,8 +1,8 @@
 """Reduction of a viscoelastic body to the few states that run at 1 kHz, and the evidence for them."""
 
-from palpate.reduction.block_form import discretise
 from palpate.reduction.evidence import measure
 from palpate.reduction.methods import METHODS, Method, Reduction, ReductionError, reduce
+from palpate.reduction.sampling import discretise
 from palpate.reduction.surface import SurfaceOutput, fit_surface_output
 
 __all__ = [

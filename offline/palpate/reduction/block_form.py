@@ -1,11 +1,11 @@
-"""Between diagonal systems and the real 2x2-block state space that runs, and its first-order-hold discretisation."""
+"""Between diagonal systems and the real 2x2-block state space that runs."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.diagonal_system import DiagonalSystem, first_order_hold
+from palpate.diagonal_system import DiagonalSystem
 from palpate.model import StateSpace
 
 _LARGEST_CONDITION = 1e10  # beyond it the diagonal form keeps fewer than six digits
@@ -99,29 +99,3 @@ def from_block_form(state_space: StateSpace) -> DiagonalSystem:
     return DiagonalSystem(
         poles[kept], b[kept], c[:, kept], np.array(state_space.d), np.arange(int(np.count_nonzero(kept)))
     )
-
-
-def discretise(state_space: StateSpace, period_s: float) -> StateSpace:
-    """Exact first-order hold at period_s, in the running form y = C xi + D u, then xi+ = A xi + B u.
-
-    For inputs that are linear between samples the output at the samples is the continuous system's own. With
-    x+ = Phi x + B0 u + B1 u+ (`first_order_hold`), xi = x - B1 u needs the newest sample alone:
-    A = Phi, B = B0 + Phi B1, D + C B1. (Franklin, Powell & Workman 1998, section 6.3.2: the triangle hold.)
-    """
-    if not (np.isfinite(period_s) and period_s > 0):
-        raise ValueError(f"period_s = {period_s}: expected a finite number above 0")
-    system = from_block_form(state_space)
-    decay, old, new = first_order_hold(system.poles * period_s)
-    b_new = (period_s * new)[:, None] * system.b
-    b = (period_s * old)[:, None] * system.b + decay[:, None] * b_new
-    weight = np.where(system.is_pair, 2.0, 1.0)
-    d = system.d + np.real((weight * system.c) @ b_new)
-    down = decay.imag < 0
-    discrete = DiagonalSystem(
-        np.where(down, decay.conj(), decay),
-        np.where(down[:, None], b.conj(), b),
-        np.where(down, system.c.conj(), system.c),
-        d,
-        system.group,
-    )
-    return to_block_form(discrete)

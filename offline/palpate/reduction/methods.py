@@ -34,6 +34,9 @@ _BAND_FREQUENCIES = 120
 _RANK_TOLERANCE = 1e-13  # Hankel singular values below it, relative, are round-off
 
 
+Response = Callable[[DiagonalSystem, Array], NDArray[np.complex128]]
+
+
 class ReductionError(ValueError):
     """A system can't be reduced as asked; the message says why."""
 
@@ -82,6 +85,7 @@ def reduce(
     order: int | None = None,
     tolerance: float | None = None,
     band_hz: tuple[float, float] = (0.0, 30.0),
+    response: Response | None = None,
 ) -> Reduction:
     """Reduce a stable system to `order` states, or to the fewest that keep the force error in the band.
 
@@ -94,6 +98,8 @@ def reduce(
                for modal methods as many as the whole modes that fit in have
     tolerance  largest over the band of |F - F_reduced| / |F|, a fraction, for every method
     band_hz    (low, high), 0 <= low < high
+    response   what the tolerance holds for: maps a reduced system and frequencies omega (n,), rad/s, to its response
+               (n, n_outputs, n_inputs), for example once sampled; left out: F_reduced(j omega)
 
     Raises ReductionError where the system is not stable (nothing is reduced silently then), the order is too
     small for the method, or the tolerance is not reached; ValueError for arguments out of range.
@@ -113,13 +119,17 @@ def reduce(
         reduced = family.at(chosen)
     else:
         assert tolerance is not None  # _check_arguments has seen to it
-        reduced, chosen = _smallest(system, family, tolerance, band_hz, method)
+        reduced, chosen = _smallest(system, family, tolerance, band_hz, method, response or _continuous)
     if not reduced.spectral_abscissa < 0:
         raise ReductionError(
             f"{method} at order {chosen} has a spectral abscissa of {reduced.spectral_abscissa:.3g} 1/s, "
             "expected below 0: choose another order"
         )
     return Reduction(method, reduced, singular_values, None if tail is None else tail(chosen))
+
+
+def _continuous(system: DiagonalSystem, omega: Array) -> NDArray[np.complex128]:
+    return system.transfer(1j * omega)
 
 
 def _check_arguments(
@@ -249,6 +259,7 @@ def _smallest(
     tolerance: float,
     band_hz: tuple[float, float],
     method: str,
+    response: Response,
 ) -> tuple[DiagonalSystem, int]:
     """The first stable system within the tolerance: up a ladder of orders, then all orders on its last rung.
 
@@ -263,9 +274,9 @@ def _smallest(
         reduced = family.at(order)
         # Between the samples only the reduced model's own resonances can stand out.
         own = np.setdiff1d(band_frequencies((reduced,), band_hz), omega)
-        error = float(np.max(relative_errors(full, reduced.transfer(1j * omega))))
+        error = float(np.max(relative_errors(full, response(reduced, omega))))
         if error <= tolerance and len(own):
-            more = relative_errors(system.transfer(1j * own), reduced.transfer(1j * own))
+            more = relative_errors(system.transfer(1j * own), response(reduced, own))
             error = max(error, float(np.max(more)))
         if reduced.spectral_abscissa < 0:
             best = min(best, (error, order))
