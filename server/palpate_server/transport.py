@@ -42,6 +42,9 @@ def _listening_peer(endpoint: str) -> zenoh.Config:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
+        # Forces are sent unbatched: room for 16 of them while the sender's thread is held up, then drop at once.
+        "transport/link/tx/queue/size/real_time": 16,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))

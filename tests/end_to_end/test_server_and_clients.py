@@ -38,25 +38,33 @@ def wait_until(condition: Callable[[], Any], seconds: float = 20.0) -> None:
         time.sleep(0.005)
 
 
+def record_without_a_gap(
+    serve: Callable[..., Any], run_example: Callable[..., Any], recording: Path
+) -> tuple[Any, list[dict[str, str]]]:
+    """A server and every tick of a poke. Forces are best effort: on a busy machine one may be lost, so try again."""
+    for _ in range(5):
+        served = serve("--max-force-n", "1000", "--max-force-rate-n-per-s", "1e9")
+        options = ("--duration-s", "3", "--json", "--record", str(recording))
+        code, out, err = finish(run_example("headless_client.py", served.endpoint, *options))
+        summary = json.loads(out)
+        assert code == 0, err
+        assert summary["contract_broken"] == []
+        assert summary["commands_answered"] > 0
+        assert summary["round_trip_s"]["p50"] > 0
+        with recording.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        ticks = np.array([int(row["tick"]) for row in rows])
+        assert np.sum(np.diff(ticks) - 1) == summary["forces_lost"]
+        if not summary["forces_lost"]:
+            return served, rows
+        served.stop()
+    raise AssertionError("forces were lost in every one of 5 runs")
+
+
 def test_forces_through_the_wire_are_the_models_response_to_the_applied_displacements(
     serve: Callable[..., Any], run_example: Callable[..., Any], tmp_path: Path
 ) -> None:
-    served = serve("--max-force-n", "1000", "--max-force-rate-n-per-s", "1e9")
-    recording = tmp_path / "ticks.csv"
-    client = run_example(
-        "headless_client.py", served.endpoint, "--duration-s", "3", "--json", "--record", str(recording)
-    )
-    code, out, err = finish(client)
-    summary = json.loads(out)
-    assert code == 0, err
-    assert summary["contract_broken"] == []
-    assert summary["commands_answered"] > 0
-    assert summary["round_trip_s"]["p50"] > 0
-
-    with recording.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    ticks = np.array([int(row["tick"]) for row in rows])
-    assert np.all(np.diff(ticks) == 1)  # nothing was lost on loopback, so the response can be followed
+    served, rows = record_without_a_gap(serve, run_example, tmp_path / "ticks.csv")
     flags = np.array([int(row["tip.flags"]) for row in rows])
     assert not np.any(flags & LIMITS_MET)
     scale = np.array([float(row["tip.force_scale"]) for row in rows])
