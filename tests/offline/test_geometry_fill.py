@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from palpate.geometry.cloud import TriangleSurface
 from palpate.geometry.fill import fill_surface
+from palpate.geometry.regions import contact_patch
 from palpate.geometry.sampling import closest_point, depth_inside
 from palpate.geometry.shapes import box_surface
 from palpate.geometry.spacing import Refinement, SpacingField
@@ -14,7 +15,7 @@ from palpate.geometry.surface import SurfaceError, enclosed_volume
 
 RADIUS = 0.1
 BLOCK = box_surface((-0.05, -0.05, -0.06), (0.05, 0.05, 0.0))
-TIP = Refinement(center_m=(0.0, 0.0, 0.01), radius_m=0.006, spacing_m=0.002, growth=0.4, rings=True)
+TIP = Refinement(center_m=(0.0, 0.0, 0.01), radius_m=0.007, spacing_m=0.0025, growth=0.3, rings=True)
 
 
 def from_trimesh(mesh):
@@ -71,7 +72,8 @@ def test_a_node_inside_stands_for_about_its_spacing_cubed(cloud):
 
 def test_spacing_follows_the_refinement(block):
     distance = np.maximum(0, np.linalg.norm(block.points, axis=1) - TIP.radius_m)
-    np.testing.assert_allclose(block.spacing, np.minimum(0.015, 0.002 + 0.4 * distance), rtol=1e-12)
+    # Rings at most 2.5 mm apart with 7 mm midway between two of them: 2 mm.
+    np.testing.assert_allclose(block.spacing, np.minimum(0.015, 0.002 + 0.3 * distance), rtol=1e-12)
 
 
 def test_two_refinements_give_the_finer_spacing():
@@ -101,7 +103,7 @@ def test_the_volumes_of_a_ball_have_its_first_and_second_moments(ball):
 
 def test_faces_of_a_block_have_its_normals(block):
     top = (block.points[:, 2] == 0) & np.all(np.abs(block.points[:, :2]) < 0.03, axis=1)
-    assert top.sum() > 50
+    assert top.sum() > 60
     np.testing.assert_allclose(block.normals[top], np.tile([0, 0, 1], (top.sum(), 1)), atol=1e-12)
 
 
@@ -115,22 +117,31 @@ def test_corners_and_edges_of_a_block_carry_nodes(block):
     np.testing.assert_allclose(block.normals[faces_met == 3], np.where(corner, 1, -1) / np.sqrt(3), atol=0.15)
 
 
-def test_a_round_patch_has_a_ring_at_its_radius_and_the_next_one_a_spacing_out(block):
+def test_the_edge_of_a_round_patch_runs_midway_between_two_rings(block):
     radius = np.linalg.norm(block.points, axis=1)[block.boundary]
     for ring, expected in enumerate((1, 6, 12, 18, 24)):
-        near = np.abs(radius - ring * 0.002) < 1e-9
-        assert near.sum() == expected
+        assert np.sum(np.abs(radius - ring * 0.002) < 1e-9) == expected
     assert np.sum(radius <= 0.008 + 1e-9) == 1 + 6 + 12 + 18 + 24
+
+
+def test_the_nodes_of_a_round_patch_stand_for_its_disc(block):
+    patch = contact_patch(TIP.center_m, TIP.radius_m, block)
+    assert len(patch.nodes) == 1 + 6 + 12 + 18
+    # The cells of a ring of n nodes end on a polygon that is off the circle by up to (pi/n)²/2 of the radius.
+    assert block.areas[patch.nodes].sum() == pytest.approx(np.pi * TIP.radius_m**2, rel=(np.pi / 18) ** 2)
 
 
 def test_a_patch_on_a_curved_surface_keeps_its_radii():
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
-    patch = Refinement((0.03, -0.04, 0.2), 0.02, 0.01, rings=True)
-    cloud = fill_surface(from_trimesh(mesh), 0.03, [patch])
-    centre, _ = closest_point(np.array([patch.center_m]), cloud.surface.vertices, cloud.surface.triangles)
+    asked = Refinement((0.03, -0.04, 0.2), 0.025, 0.01, rings=True)
+    cloud = fill_surface(from_trimesh(mesh), 0.025, [asked])
+    centre, _ = closest_point(np.array([asked.center_m]), cloud.surface.vertices, cloud.surface.triangles)
     radius = np.linalg.norm(cloud.points[cloud.boundary] - centre, axis=1)
     for ring, expected in enumerate((1, 6, 12, 18)):
         assert np.sum(np.abs(radius - ring * 0.01) < 1e-8) == expected
+    patch = contact_patch(asked.center_m, asked.radius_m, cloud)
+    np.testing.assert_allclose(patch.center_m, centre[0], rtol=1e-12)
+    assert len(patch.nodes) == 1 + 6 + 12
 
 
 def test_the_same_seed_gives_the_same_cloud_and_another_seed_another(ball):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -51,7 +52,7 @@ def fill_surface(
     round patch finds no place on it.
     """
     check_surface(surface)
-    refinements = tuple(_on_surface(r, surface) if r.rings else r for r in refinements)
+    refinements = tuple(_fitted(r, surface) if r.rings else r for r in refinements)
     _check_spacing(surface, spacing_m, refinements)
     rng = np.random.default_rng(seed)
     field = SpacingField(spacing_m, refinements)
@@ -154,11 +155,17 @@ def _spread(
     return candidates[taken]
 
 
-def _on_surface(refinement: Refinement, surface: TriangleSurface) -> Refinement:
-    """The refinement, moved to the surface point nearest to its centre."""
-    closest, _ = closest_point(np.array([refinement.center_m]), surface.vertices, surface.triangles)
+def _fitted(patch: Refinement, surface: TriangleSurface) -> Refinement:
+    """The patch moved to the surface point nearest to its centre, its spacing (reduced) such that its rings fit."""
+    closest, _ = closest_point(np.array([patch.center_m]), surface.vertices, surface.triangles)
     x, y, z = closest[0].tolist()
-    return replace(refinement, center_m=(x, y, z))
+    spacing = patch.radius_m / (_n_rings(patch) + 0.5)
+    return replace(patch, center_m=(x, y, z), spacing_m=spacing)
+
+
+def _n_rings(patch: Refinement) -> int:
+    """The fewest rings within a patch, at spacing s, 2 s, ..., with radius = (n_rings + 1/2) s and s <= spacing."""
+    return max(1, math.ceil(patch.radius_m / patch.spacing_m - 0.5 - 1e-9))
 
 
 def _patches(surface: TriangleSurface, field: SpacingField) -> Array:
@@ -178,7 +185,7 @@ def _patches(surface: TriangleSurface, field: SpacingField) -> Array:
 
 
 def _rings(surface: TriangleSurface, patch: Refinement) -> Array:
-    """(n, 3): a patch's centre, rings up to its radius with 6 k nodes on ring k, and one ring beyond, m.
+    """(n, 3): a fitted patch's centre, its rings, and one ring beyond its radius, with 6 k nodes on ring k, m.
 
     A ring's nodes are the points of the surface at its distance from the centre, found by going back and forth
     between sphere and surface.
@@ -190,10 +197,9 @@ def _rings(surface: TriangleSurface, patch: Refinement) -> Array:
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)
-    n_rings = max(1, round(patch.radius_m / patch.spacing_m))
     nodes = [centre]
-    for k in range(1, n_rings + 2):
-        radius = k * patch.radius_m / n_rings
+    for k in range(1, _n_rings(patch) + 2):
+        radius = k * patch.spacing_m
         angle = 2 * np.pi * (np.arange(6 * k) + 0.5 * (k % 2)) / (6 * k)
         ring = centre + radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
         for _ in range(100):
