@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import igl
@@ -55,9 +56,11 @@ def depth_inside(points: Array, surface: TriangleSurface) -> Array:
 
 
 def sample_elements(
-    vertices: Array, elements: Indices, field: SpacingField, fineness: float
+    vertices: Array, elements: Indices, field: Callable[[Array], Array], fineness: float
 ) -> tuple[Samples, Indices]:
     """Centroids of segments (n, 2) or triangles (n, 3), halved across their longest edge down to fineness * h there.
+
+    field  the spacing h of the nodes, m, (n,) at points (n, 3)
 
     Returns the samples and the element that each lies in, (n_samples,).
     """
