@@ -13,7 +13,7 @@ from palpate.system import ElasticModes
 
 Array = NDArray[np.float64]
 
-_FIT_FREQUENCIES = 64
+_LEAST_FIT_FREQUENCIES = 64
 _SINGULAR_VALUE_CUT = 1e-9  # below it, relative, the states are too alike in the band to be told apart
 
 
@@ -59,7 +59,8 @@ def fit_surface_output(
             f"surface_shapes {surface_shapes.shape} and surface_patch_shapes {surface_patch_shapes.shape}: expected "
             f"{expected[0]} and {expected[1]}"
         )
-    omega = _frequencies(modes, prony, band_hz)
+    # Each gives 2 n_inputs equations for a row's `order` unknowns, so as many as states leave none to chance.
+    omega = _frequencies(modes, prony, band_hz, max(_LEAST_FIT_FREQUENCIES, discrete.order))
     fitted, held_out = omega[0::2], omega[1::2]
     full = _surface_response(modes, prony, surface_shapes, surface_patch_shapes, fitted)
     states = _state_response(discrete, fitted, period_s)
@@ -89,13 +90,13 @@ def fit_surface_output(
     return SurfaceOutput(output32, feedthrough32, error)
 
 
-def _frequencies(modes: ElasticModes, prony: PronySeries, band_hz: tuple[float, float]) -> Array:
-    """(n,), rad/s, ascending: half of them even, half of them even in the logarithm, from a slow one to the band's end."""
+def _frequencies(modes: ElasticModes, prony: PronySeries, band_hz: tuple[float, float], n: int) -> Array:
+    """(2 n,), rad/s, ascending: half even, half even in the logarithm, from a slow one to the band's end."""
     low, high = 2 * np.pi * band_hz[0], 2 * np.pi * band_hz[1]
     slowest = min([float(np.sqrt(np.min(np.abs(modes.squared_frequencies)))), *(1 / t for t in prony.tau_s)])
     start = max(low, min(slowest, high) / 10)
-    even = start + (high - start) * (np.arange(_FIT_FREQUENCIES) + 0.5) / _FIT_FREQUENCIES
-    return np.sort(np.concatenate([np.geomspace(start, high, _FIT_FREQUENCIES), even]))
+    even = start + (high - start) * (np.arange(n) + 0.5) / n
+    return np.sort(np.concatenate([np.geomspace(start, high, n), even]))
 
 
 def _surface_response(

@@ -1,0 +1,106 @@
+"""The reductions on whole bodies: the paper's cube with 8,067 states and the shipped liver."""
+
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from palpate.discretization import collocation, conservative
+from palpate.geometry.fill import fill_surface
+from palpate.geometry.regions import PlaneRegion, contact_patch, nodes_in
+from palpate.geometry.shapes import box_lattice
+from palpate.geometry.spacing import Refinement
+from palpate.geometry.surface import load_surface
+from palpate.material import PRESETS
+from palpate.reduction import discretise, fit_surface_output, reduce
+from palpate.reduction.evidence import hinf_error, in_band_error
+from palpate.reduction.frequencies import band_frequencies
+from palpate.viscoelastic import viscoelastic_system
+
+
+def cube(n, discretization):
+    """The paper's section 4.2: bottom fixed, a tip of the nodes around the top centre."""
+    cloud = box_lattice((0, 0, 0), (1, 1, 1), (n, n, n))
+    material = PRESETS["paper-cube"]
+    bottom = np.flatnonzero(cloud.points[:, 2] < 1e-9)
+    distance = np.linalg.norm(cloud.points - (0.5, 0.5, 1.0), axis=1)
+    tip = np.flatnonzero(distance < 0.75 / (n - 1))
+    modes = discretization.elastic_modes(cloud, material, bottom, [tip])
+    return modes, viscoelastic_system(modes, material.prony)
+
+
+def static_error(full, reduced):
+    return in_band_error(full, reduced, np.zeros(1))
+
+
+@pytest.mark.slow
+def test_balanced_truncation_of_the_cube_with_a_thousand_nodes_is_below_one_percent_at_order_200():
+    _, full = cube(10, conservative)
+    assert full.n_states == 8067
+    assert full.is_symmetric
+    largest = np.linalg.norm(full.d, 2)
+    errors = {}
+    for order in (120, 200):
+        reduction = reduce(full, "tbr", order=order)
+        errors[order] = hinf_error(full, reduction.system)
+        assert reduction.system.spectral_abscissa < 0
+        assert errors[order] <= reduction.error_bound / largest
+    assert errors[200] < 0.01
+    assert errors[200] < errors[120]
+
+
+@pytest.mark.slow
+def test_band_limited_truncation_of_the_cube_is_exact_to_four_digits_in_its_band_at_order_100():
+    _, full = cube(10, conservative)
+    band_hz = (0.0, 0.4)
+    reduced = reduce(full, "tbr-band", order=100, band_hz=band_hz).system
+    assert in_band_error(full, reduced, band_frequencies((full, reduced), band_hz)) < 1e-4
+
+
+def test_the_collocated_cube_reduces_to_stable_models_inside_the_bound():
+    _, full = cube(6, collocation)
+    assert full.spectral_abscissa < 0
+    assert not full.is_symmetric
+    largest = np.linalg.norm(full.d, 2)
+    for order in (40, 80):
+        reduction = reduce(full, "tbr", order=order)
+        assert reduction.system.spectral_abscissa < 0
+        assert hinf_error(full, reduction.system) <= reduction.error_bound / largest
+    band_hz = (0.0, 0.2)
+    reduced = reduce(full, "tbr-band", tolerance=0.01, band_hz=band_hz).system
+    assert in_band_error(full, reduced, band_frequencies((full, reduced), band_hz)) <= 0.0101
+    assert reduced.n_states < 60
+
+
+@pytest.mark.slow
+def test_band_limited_truncation_of_the_liver_is_within_two_percent_at_order_120():
+    material = PRESETS["liver"]
+    with resources.as_file(resources.files("palpate.data") / "liver.ply") as path:
+        surface = load_surface(path)
+    point, radius, band_hz = (0.02, -0.07, 0.0), 0.005, (0.0, 30.0)
+    center = contact_patch(point, 0.02, fill_surface(surface, 0.03)).center_m
+    cloud = fill_surface(surface, 0.0125, (Refinement(tuple(center), radius, 0.003, rings=True),))
+    back = nodes_in(PlaneRegion((0, 0.07, 0), (0, 1, 0)), cloud)
+    tip = contact_patch(point, radius, cloud)
+    assert len(tip.nodes) > 10
+    modes = conservative.elastic_modes(cloud, material, back, [tip.nodes])
+    full = viscoelastic_system(modes, material.prony)
+    assert full.n_states > 10_000
+    reduction = reduce(full, "tbr-band", order=120, band_hz=band_hz)
+    assert in_band_error(full, reduction.system, band_frequencies((full, reduction.system), band_hz)) < 0.02
+    assert static_error(full, reduction.system) < 0.02
+    plain = reduce(full, "tbr", order=120).system
+    assert static_error(full, plain) > 1  # why band-limited balancing is the default for organs
+
+    boundary = np.flatnonzero(cloud.boundary)
+    rows = (3 * boundary[:, None] + np.arange(3)).ravel()
+    displacement = fit_surface_output(
+        modes,
+        material.prony,
+        modes.shapes[rows],
+        modes.patch_shapes[rows],
+        discretise(reduction.state_space, 1e-3),
+        period_s=1e-3,
+        band_hz=band_hz,
+    )
+    assert displacement.error_in_band < 0.25
