@@ -70,10 +70,32 @@ def test_the_hold_answers_the_images_of_a_sampled_sine_as_well() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
 
 
+def test_prewarping_puts_the_poles_of_the_band_where_the_hold_has_them() -> None:
+    system = stiff_contact()
+    near = np.abs(system.poles) <= 1.5 * 2 * np.pi * 30
+    assert 10 < np.count_nonzero(near) < len(near)
+    warped = sample(system, PERIOD_S, "bilinear", 30.0).poles[near]
+    np.testing.assert_allclose(warped, np.exp(system.poles[near] * PERIOD_S), rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_prewarping_takes_the_error_of_sharp_resonances_away_and_leaves_the_body_passive(seed: int) -> None:
+    system = stiff_contact(seed)
+    omega = 2 * np.pi * np.linspace(0.1, 30, 600)
+    exact = system.transfer(1j * omega)
+
+    def error(band_hz: float) -> float:
+        sampled = sampled_response(system, omega, PERIOD_S, "bilinear", band_hz)
+        return float(np.max(np.linalg.norm(sampled - exact, 2, (1, 2)) / np.linalg.norm(exact, 2, (1, 2))))
+
+    assert error(30.0) < 0.25 * error(0.0)
+    assert passivity_margin(sample(system, PERIOD_S, "bilinear", 30.0)) >= -1e-9
+
+
 def test_both_rules_keep_the_statics() -> None:
     system = stiff_contact()
     for rule in ("bilinear", "first-order-hold"):
-        static = sample(system, PERIOD_S, rule).transfer(np.ones(1, dtype=complex))[0].real
+        static = sample(system, PERIOD_S, rule, 30.0).transfer(np.ones(1, dtype=complex))[0].real
         np.testing.assert_allclose(static, system.static_gain(), rtol=1e-7, atol=1e-7)
 
 

@@ -4,8 +4,13 @@ Both answer a displacement with the force at the same sample. They differ in wha
 to be. The first-order hold draws straight lines: exact for those, but a sampled smooth motion then has images around
 every multiple of the sampling rate, which a stiff contact answers with its instant stiffness, and the kinks make the
 sampled model give out energy that the tissue never had. The trapezoidal (bilinear) rule evaluates F at
-s = 2/T (z - 1)/(z + 1): nothing above half the sampling rate exists for it, what absorbs energy goes on absorbing it,
-and all that it costs is a shift of frequencies by (omega T)²/12, 0.3 % at 30 Hz and 1 kHz.
+s = 2/T (z - 1)/(z + 1): nothing above half the sampling rate exists for it, and what absorbs energy goes on absorbing
+it. It shifts frequencies by (omega T)²/12, 0.3 % at 30 Hz and 1 kHz, which sharp resonances do not forgive: poles in
+and near the haptic band are therefore prewarped, so that they fall where they belong.
+
+Measured on the liver (order 105, tip stiffness 70 N/m at rest and 4.7 kN/m instantly, 1 kHz), largest force error in
+0-30 Hz and passivity margin: continuous 1.4 %; first-order hold 14 %, -4.0; trapezoidal 1.9 %, -0.11; prewarped 1.4 %,
+-0.11. Even the unreduced model has 7.5 % and -15 by the hold, 0.8 % and a margin above 0 by the trapezoidal rule.
 Tustin 1947; Franklin, Powell & Workman 1998, sections 6.1 and 6.3.2.
 """
 
@@ -24,17 +29,25 @@ SamplingRule = Literal["bilinear", "first-order-hold"]
 SAMPLING_RULES: tuple[str, ...] = get_args(SamplingRule)
 
 
+_NEAR_BAND = 1.5
+"""Poles up to this many times the band's upper end are prewarped: further out a shift matters less than the residue's."""
+
+
 def discretise(
-    state_space: StateSpace, period_s: float, rule: SamplingRule = "first-order-hold"
+    state_space: StateSpace, period_s: float, rule: SamplingRule = "first-order-hold", band_hz: float = 0.0
 ) -> StateSpace:
     """The state space sampled at period_s, in the running form y = C xi + D u, then xi+ = A xi + B u.
 
+    band_hz  upper end of the band in which the trapezoidal rule is to be true to frequency, Hz; 0: nowhere
+
     Raises ValueError for a period that is not above 0 or an unknown rule.
     """
-    return to_block_form(sample(from_block_form(state_space), period_s, rule))
+    return to_block_form(sample(from_block_form(state_space), period_s, rule, band_hz))
 
 
-def sample(system: DiagonalSystem, period_s: float, rule: SamplingRule) -> DiagonalSystem:
+def sample(
+    system: DiagonalSystem, period_s: float, rule: SamplingRule, band_hz: float = 0.0
+) -> DiagonalSystem:
     """The same for a diagonal system; its poles are then those of z.
 
     Either rule steps x+ = Phi x + B0 u + B1 u+, y = C x + D u; with xi = x - B1 u the newest sample is enough:
@@ -44,6 +57,8 @@ def sample(system: DiagonalSystem, period_s: float, rule: SamplingRule) -> Diago
         raise ValueError(f"period_s = {period_s}: expected a finite number above 0")
     if rule not in SAMPLING_RULES:
         raise ValueError(f"rule = {rule!r}: expected one of {', '.join(SAMPLING_RULES)}")
+    if rule == "bilinear":
+        system = _prewarped(system, period_s, 2 * np.pi * _NEAR_BAND * band_hz)
     weights = first_order_hold if rule == "first-order-hold" else trapezoidal_rule
     decay, old, new = weights(system.poles * period_s)
     b_new = (period_s * new)[:, None] * system.b
@@ -69,7 +84,26 @@ def trapezoidal_rule(
 
 
 def sampled_response(
-    system: DiagonalSystem, omega: NDArray[np.float64], period_s: float, rule: SamplingRule
+    system: DiagonalSystem,
+    omega: NDArray[np.float64],
+    period_s: float,
+    rule: SamplingRule,
+    band_hz: float = 0.0,
 ) -> NDArray[np.complex128]:
     """(n, n_outputs, n_inputs): response of the system, once sampled, to sines of omega (n,), rad/s, below pi/period_s."""
-    return sample(system, period_s, rule).transfer(np.exp(1j * omega * period_s))
+    return sample(system, period_s, rule, band_hz).transfer(np.exp(1j * omega * period_s))
+
+
+def _prewarped(system: DiagonalSystem, period_s: float, limit: float) -> DiagonalSystem:
+    """Poles of modulus up to `limit`, rad/s, moved to g(p) = 2/T tanh(p T/2), which the trapezoidal rule maps to e^{pT}.
+
+    Residues go by g'(p), so that r/(s - p) stays itself near s = p once s is warped too, and D keeps the statics.
+    """
+    moved = np.abs(system.poles) <= limit
+    tangent = np.tanh(np.where(moved, system.poles, 0) * period_s / 2)
+    poles = np.where(moved, 2 / period_s * tangent, system.poles)
+    gain = np.sqrt(1 - tangent**2)
+    b, c = gain[:, None] * system.b, gain * system.c
+    weight = np.where(system.is_pair, 2.0, 1.0)
+    lost = np.real((weight * c / poles) @ b) - np.real((weight * system.c / system.poles) @ system.b)
+    return DiagonalSystem(poles, b, c, system.d + lost, system.group)

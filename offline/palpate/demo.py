@@ -1,0 +1,185 @@
+"""The first ten minutes in one command: build the liver, serve it in a second process, poke it, draw what was felt."""
+
+from __future__ import annotations
+
+import csv
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from palpate.build import Report, build_model
+from palpate.config import fingerprint, load_config
+from palpate.diagonal_system import DiagonalSystem
+from palpate.model import ModelFileError, ReducedModel, load_model, save_model
+from palpate.plots import Touch, draw_touch, require_matplotlib
+
+Array = NDArray[np.float64]
+
+_START_TIMEOUT_S = 60.0
+_STOP_TIMEOUT_S = 10.0
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What a demonstration leaves behind.
+
+    client        the headless client's summary, as it prints it with --json
+    touch         the recorded poke beside the full model's answer
+    error         largest force error over the largest force, on this poke
+    error_in_band the same within the model's haptic band
+    """
+
+    model: ReducedModel
+    model_path: Path
+    picture: Path
+    client: dict[str, Any]
+    touch: Touch
+    error: float
+    error_in_band: float
+
+    def print(self, console: Console) -> None:
+        """The latency and force summary."""
+        trip = self.client["round_trip_s"]
+        times = ", ".join(f"{name} {1e6 * trip[key]:.0f}" for name, key in (("p50", "p50"), ("p99", "p99")))
+        inward = -np.asarray(self.model.contacts[0].normal)
+        force = self.touch.force_n[:, :3] @ inward
+        depth = self.touch.displacement_m[:, :3] @ inward
+        lines = (
+            f"commands      {self.client['commands_sent']:,} sent, {self.client['commands_answered']:,} answered",
+            f"round trip    {times} microseconds, command to force, over the wire",
+            f"depth         up to {1e3 * depth.max():.2f} mm",
+            f"force         {force.min():+.3f} to {force.max():+.3f} N along the inward normal",
+            f"full model    served and exact force differ by at most {100 * self.error_in_band:.2g} % of the largest "
+            f"force below {self.model.evidence.band_hz[1]:g} Hz (the file states {100 * self.model.evidence.error_in_band:.2g} %); "
+            f"{100 * self.error:.2g} % with all that late commands add above",
+            f"contract      {'BROKEN: ' + '; '.join(self.client['contract_broken']) if self.client['contract_broken'] else 'held'}",
+            f"model         {self.model_path}",
+            f"picture       {self.picture}",
+        )
+        console.print("\n".join(lines), highlight=False, soft_wrap=True)
+
+
+def run_demo(config_path: Path, out: Path, seconds: float, report: Report) -> Demo:
+    """Build (unless `out` holds a model of the very same configuration), serve, poke for `seconds`, draw.
+
+    Raises what `build_model` raises, and ValueError when server or client fail, with what they said.
+    """
+    require_matplotlib()
+    out.mkdir(parents=True, exist_ok=True)
+    model_path = out / f"{config_path.stem}.npz"
+    model = _built(model_path, config_path, report)
+    recording = out / "poke.csv"
+    with _server(model_path, report) as endpoint:
+        report(f"poke, {seconds:g} s")
+        client = _poke(endpoint, seconds, recording)
+        report.note(f"{client['commands_answered']:,} of {client['commands_sent']:,} commands answered")
+    report("picture")
+    touch = read_touch(recording, model)
+    picture = out / "demo.png"
+    draw_touch(model, touch, 0, picture)
+    difference = touch.force_n - touch.force_full_n
+    largest = np.linalg.norm(touch.force_full_n, axis=1).max()
+    error, in_band = (
+        float(np.linalg.norm(d, axis=1).max() / largest)
+        for d in (difference, touch.in_band(difference, model))
+    )
+    return Demo(model, model_path, picture, client, touch, error, in_band)
+
+
+def read_touch(recording: Path, model: ReducedModel) -> Touch:
+    """A recording of the headless client beside the full model's exact answer to the displacement that was applied.
+
+    Raises ValueError where it lacks a column or a contact, or no tick was recorded.
+    """
+    with recording.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    if len(rows) < 2:
+        raise ValueError(f"{recording}: {len(rows)} ticks recorded, expected at least 2")
+
+    def columns(quantity: str, unit: str) -> Array:
+        names = [f"{c.name}.{quantity}_{axis}_{unit}" for c in model.contacts for axis in "xyz"]
+        missing = [n for n in names if n not in rows[0]]
+        if missing:
+            raise ValueError(f"{recording}: no column {missing[0]!r}, expected a recording of {model.name}")
+        return np.array([[float(row[n]) for n in names] for row in rows])
+
+    heard = np.array([int(row["tick"]) for row in rows])
+    scale = np.repeat(
+        [[float(row[f"{c.name}.force_scale"]) for c in model.contacts] for row in rows], 3, axis=1
+    )
+    applied, force = columns("displacement", "m"), columns("force", "n")
+    # Force messages are best effort: the displacement of a tick that was not heard is interpolated.
+    ticks = np.arange(heard[0], heard[-1] + 1)
+    every = np.stack([np.interp(ticks, heard, channel) for channel in applied.T], axis=1)
+    full = DiagonalSystem(
+        model.full.poles, model.full.b, model.full.c, model.full.d, np.arange(len(model.full.poles))
+    )
+    exact = full.response(every, model.period_s)[heard - heard[0]]
+    return Touch((heard - heard[0]) * model.period_s, applied, force, scale * exact)
+
+
+def _built(path: Path, config_path: Path, report: Report) -> ReducedModel:
+    config = load_config(config_path)
+    if path.exists():
+        try:
+            model = load_model(path)
+        except ModelFileError as error:
+            report("look at the model that is there")
+            report.note(f"{error}; building it again")
+        else:
+            if model.config_sha256 == fingerprint(config, config_path.parent):
+                report(f"model {path}")
+                report.note("already built from this configuration")
+                return model
+    model = build_model(config, config_path.parent, report)
+    save_model(model, path)
+    return model
+
+
+@contextmanager
+def _server(model_path: Path, report: Report) -> Iterator[str]:
+    """A server process on a free port of this machine, ended on the way out; gives its endpoint."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    report("server in a second process")
+    command = [sys.executable, "-m", "palpate_server", str(model_path), "--listen", endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            first = process.stdout.readline().strip()
+            if not first:
+                raise ValueError(f"the server did not start (exit code {process.wait(_STOP_TIMEOUT_S)})")
+            report.note(first)
+            yield endpoint
+        finally:
+            process.terminate()
+            try:
+                process.wait(_STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def _poke(endpoint: str, seconds: float, recording: Path) -> dict[str, Any]:
+    client = str(files("palpate_client_examples") / "headless_client.py")
+    command = [sys.executable, client, "--connect", endpoint, "--duration-s", str(seconds)]
+    command += ["--json", "--record", str(recording)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=seconds + _START_TIMEOUT_S, check=False
+    )
+    try:
+        summary: dict[str, Any] = json.loads(done.stdout)
+    except json.JSONDecodeError:
+        raise ValueError(f"the client failed (exit code {done.returncode}): {done.stderr.strip()}") from None
+    return summary

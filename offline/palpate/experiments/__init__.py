@@ -1,0 +1,1 @@
+"""Studies that a reader can rerun: what the methods do, as tables and pictures."""

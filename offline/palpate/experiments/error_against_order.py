@@ -1,0 +1,130 @@
+"""Which reduction to use: in-band and static force error of all four methods against their order.
+
+    python -m palpate.experiments.error_against_order configs/liver.toml --out docs/images/liver_error_against_order
+
+writes OUT.csv and OUT.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from palpate.build import FullModel, build_full_model
+from palpate.cli import stage_reporter
+from palpate.config import load_config
+from palpate.plots import require_matplotlib
+from palpate.reduction.evidence import hinf_error, in_band_error
+from palpate.reduction.frequencies import band_frequencies, relative_errors
+from palpate.reduction.methods import METHODS, ReductionError, reduce
+
+ORDERS = (20, 30, 40, 60, 80, 100, 120, 160, 200)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One reduced model: relative errors are fractions; `order` is the order that the method reached."""
+
+    method: str
+    order: int
+    error_in_band: float
+    error_static: float
+    error_hinf: float
+
+
+def error_against_order(
+    full: FullModel, band_hz: tuple[float, float], orders: Sequence[int] = ORDERS
+) -> list[Row]:
+    """A row for each method and order; orders that a method does not have are left out."""
+    rows = []
+    zero = np.zeros(1, dtype=np.complex128)
+    for method in METHODS:
+        for order in orders:
+            try:
+                reduced = reduce(full.system, method, order=order, band_hz=band_hz).system
+            except ReductionError:
+                continue
+            omega = band_frequencies((full.system, reduced), band_hz)
+            rows.append(
+                Row(
+                    method,
+                    reduced.n_states,
+                    in_band_error(full.system, reduced, omega),
+                    float(relative_errors(full.system.transfer(zero), reduced.transfer(zero))[0]),
+                    hinf_error(full.system, reduced),
+                )
+            )
+    return rows
+
+
+def write_table(rows: Sequence[Row], path: Path) -> None:
+    """Comma-separated values with a header."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["method", "order", "error_in_band", "error_static", "error_hinf"])
+        writer.writerows(
+            [r.method, r.order, f"{r.error_in_band:.4e}", f"{r.error_static:.4e}", f"{r.error_hinf:.4e}"]
+            for r in rows
+        )
+
+
+def draw(rows: Sequence[Row], title: str, band_hz: tuple[float, float], path: Path) -> None:
+    """Three panels: error in the haptic band, at 0 Hz, and over all frequencies."""
+    require_matplotlib()
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    panels = (
+        ("error_in_band", f"force error in {band_hz[0]:g}-{band_hz[1]:g} Hz"),
+        ("error_static", "force error at 0 Hz"),
+        ("error_hinf", "H-infinity error over the largest response"),
+    )
+    styles = {"tbr": "o-", "tbr-band": "s-", "modal": "^--", "modal-static": "v--"}
+    figure, axes = plt.subplots(1, 3, figsize=(14, 4.6), layout="constrained")
+    for axis, (field, label) in zip(axes, panels, strict=True):
+        for method in METHODS:
+            chosen = [r for r in rows if r.method == method]
+            values = np.array([getattr(r, field) for r in chosen])
+            if field == "error_static" and method == "modal-static":
+                continue  # exact by construction: round-off says nothing
+            axis.semilogy([r.order for r in chosen], values, styles[method], label=method, markersize=4)
+        axis.axhline(0.02, color="0.5", linewidth=0.8, linestyle=":")
+        axis.annotate(
+            "2 %", (0.99, 0.02), xycoords=("axes fraction", "data"), ha="right", va="bottom", color="0.4"
+        )
+        axis.set(xlabel="order (states)", title=label)
+        axis.grid(alpha=0.25, which="both")
+    axes[0].set_ylabel("relative error")
+    axes[0].legend(frameon=False)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("config", type=Path)
+    parser.add_argument("--out", type=Path, required=True, help="path without its ending")
+    arguments = parser.parse_args()
+    config = load_config(arguments.config)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    with stage_reporter() as report:
+        full = build_full_model(config, arguments.config.parent, report)
+        report("error against order, four methods")
+        rows = error_against_order(full, config.reduction.band_hz)
+    write_table(rows, arguments.out.with_suffix(".csv"))
+    title = f"{config.name}: {full.cloud.n_nodes:,} nodes, {full.system.n_states:,} states in full"
+    draw(rows, title, config.reduction.band_hz, arguments.out.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""Pictures: the poke of the demonstration, and error against order. Needs the extra `plots`."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, sosfiltfilt
+
+from palpate.model import ReducedModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Touch:
+    """One recorded poke and what the full model answers to it.
+
+    time_s           (n_ticks,), s
+    displacement_m   (n_ticks, n_inputs), applied by the server at each tick
+    force_n          (n_ticks, n_outputs), as received over the wire
+    force_full_n     (n_ticks, n_outputs), the full model's exact response to the same displacement
+    """
+
+    time_s: Array
+    displacement_m: Array
+    force_n: Array
+    force_full_n: Array
+
+    def in_band(self, signal: Array, model: ReducedModel) -> Array:
+        """The part of a signal (n_ticks, k) within the model's haptic band, without delay."""
+        low, high = model.evidence.band_hz
+        rate = 1 / model.period_s
+        if low == 0:
+            filter_ = butter(4, high, "lowpass", fs=rate, output="sos")
+        else:
+            filter_ = butter(4, (low, high), "bandpass", fs=rate, output="sos")
+        return np.asarray(sosfiltfilt(filter_, signal, axis=0))
+
+
+def require_matplotlib() -> None:
+    """Raises ValueError with the way out when matplotlib is not installed."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ValueError("pictures need matplotlib: pip install 'palpate[plots]'")
+
+
+def draw_touch(model: ReducedModel, touch: Touch, contact: int, path: Path) -> None:
+    """The body at the deepest point of the poke, and tip displacement, force and error over time.
+
+    contact  index of the contact patch that was poked
+    path     picture to write; its folder must exist
+    """
+    require_matplotlib()
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    along = slice(3 * contact, 3 * contact + 3)
+    inward = -np.asarray(model.contacts[contact].normal)
+    depth = touch.displacement_m[:, along] @ inward
+    served, full = touch.force_n[:, along] @ inward, touch.force_full_n[:, along] @ inward
+    largest = float(np.max(np.linalg.norm(touch.force_full_n, axis=1)))
+    deepest = int(np.argmax(np.abs(depth)))
+
+    figure = plt.figure(figsize=(13.5, 7.2), layout="constrained")
+    halves: Any = figure.subfigures(1, 2, width_ratios=[1.0, 1.15])
+    left, right = halves
+    surface = surface_displacement(model, touch.displacement_m[: deepest + 1])
+    _draw_body(left, model, contact, surface)
+
+    axes = right.subplots(3, 1, sharex=True)
+    axes[0].plot(touch.time_s, 1e3 * depth, color="tab:green")
+    axes[0].set_ylabel("tip displacement, mm\n(into the tissue)")
+    axes[0].axvline(touch.time_s[deepest], color="0.6", linewidth=0.8, linestyle=":")
+    axes[1].plot(
+        touch.time_s, full, color="0.55", linewidth=3.0, label=f"full model, {model.n_states_full:,} states"
+    )
+    axes[1].plot(
+        touch.time_s, served, color="tab:red", linewidth=1.1, label=f"over the wire, order {model.order}"
+    )
+    axes[1].set_ylabel("reaction force, N\n(along the inward normal)")
+    axes[1].set_ylim(top=1.35 * float(max(full.max(), served.max())))
+    axes[1].legend(loc="upper right", ncols=2, frameon=False, fontsize="small")
+    difference = touch.force_n - touch.force_full_n
+    for values, style, label in (
+        (difference, {"color": "0.75", "linewidth": 0.6}, "every frequency"),
+        (touch.in_band(difference, model), {"color": "tab:blue"}, f"below {model.evidence.band_hz[1]:g} Hz"),
+    ):
+        error = np.linalg.norm(values, axis=1) / largest
+        axes[2].semilogy(touch.time_s, np.maximum(error, 1e-6), label=label, **style)
+    stated = model.evidence.error_in_band
+    axes[2].axhline(
+        stated, color="tab:orange", linestyle="--", label=f"stated in-band error, {100 * stated:.2g} %"
+    )
+    axes[2].set_ylim(1e-5, 1)
+    axes[2].set_ylabel("force error over\nlargest force")
+    axes[2].set_xlabel("time, s")
+    axes[2].legend(loc="lower center", ncols=3, frameon=False, fontsize="small")
+    for axis in axes:
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    right.suptitle("One poke through the 1 kHz server")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def surface_displacement(model: ReducedModel, displacement_m: Array) -> Array:
+    """(n_vertices, 3), m: the surface after the displacements (n_ticks, n_inputs) have been applied from rest."""
+    a = model.discrete
+    partner = np.arange(a.order) ^ 1
+    state = np.zeros(a.order)
+    for u in displacement_m[:-1]:
+        state = a.diagonal * state + a.cross * state[partner] + a.b @ u
+    moved = model.surface.output @ state + model.surface.feedthrough @ displacement_m[-1]
+    return np.asarray(moved, dtype=float).reshape(-1, 3)
+
+
+def _draw_body(figure: Any, model: ReducedModel, contact: int, displacement: Array) -> None:
+    """The deformed surface, coloured by how far it moved, seen from above the contact."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LogNorm
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    patch = model.contacts[contact]
+    vertices = 1e3 * (model.surface.vertices + displacement)
+    corners = vertices[model.surface.triangles]
+    moved = 1e3 * np.linalg.norm(displacement, axis=1)
+    per_triangle = moved[model.surface.triangles].mean(axis=1)
+    top = max(float(moved.max()), 1e-9)
+    norm = LogNorm(vmin=1e-3 * top, vmax=top, clip=True)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
+    normal = np.asarray(patch.normal)
+    light = normal + np.array([0.3, -0.2, 0.5])
+    shade = 0.45 + 0.55 * np.clip(facing @ (light / np.linalg.norm(light)), 0, 1)
+    mapper = ScalarMappable(norm=norm, cmap="magma")
+    colors = mapper.to_rgba(per_triangle)
+    colors[:, :3] *= shade[:, None]
+
+    axis = figure.add_subplot(projection="3d")
+    axis.add_collection3d(Poly3DCollection(corners, facecolors=colors, edgecolors=colors, linewidths=0.3))
+    tip = 1e3 * np.asarray(patch.center_m)
+    shaft = np.stack([tip, tip + 45 * normal])
+    axis.plot(*shaft.T, color="tab:cyan", linewidth=3, zorder=10)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    for setter, a, b in zip((axis.set_xlim, axis.set_ylim, axis.set_zlim), low, high, strict=True):
+        setter(a, b)
+    axis.set_box_aspect(high - low)
+    elevation = np.degrees(np.arcsin(np.clip(normal[2], -1, 1)))
+    azimuth = np.degrees(np.arctan2(normal[1], normal[0]))
+    axis.view_init(elev=float(np.clip(elevation - 25, -60, 60)), azim=float(azimuth) + 35)
+    axis.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
+    axis.set_title(f"{model.name} at the deepest point, tool at '{patch.name}'")
+    figure.colorbar(mapper, ax=axis, shrink=0.6, pad=0.08, label="displacement, mm")

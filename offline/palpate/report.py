@@ -1,0 +1,72 @@
+"""The evidence of a model's accuracy as a table for a person."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.table import Table
+
+from palpate.model import ReducedModel
+
+
+def percent(fraction: float) -> str:
+    """A relative error in percent with two significant digits."""
+    return f"{100 * fraction:.2g} %"
+
+
+def evidence_table(model: ReducedModel) -> Table:
+    """What the model is and how good it is, a line each."""
+    evidence = model.evidence
+    table = Table(
+        title=f"{model.name}: {model.method}, order {model.order}", title_justify="left", min_width=72
+    )
+    table.add_column("evidence", no_wrap=True)
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column("meaning", style="dim")
+
+    low, high = evidence.band_hz
+    bound = "none for this method" if evidence.error_bound is None else percent(evidence.error_bound)
+    table.add_row(
+        "states",
+        f"{model.n_states_full:,} → {model.order}",
+        f"{model.n_nodes:,} nodes",
+    )
+    table.add_row("error in band", percent(evidence.error_in_band), f"force, largest in {low:g}-{high:g} Hz")
+    table.add_row(
+        "before sampling", percent(evidence.error_in_band_continuous), "the reduction's share of it"
+    )
+    table.add_row("error at 0 Hz", percent(evidence.error_static), "static force")
+    table.add_row("error, H-infinity", percent(evidence.error_hinf), "of the largest response")
+    table.add_row("bound, H-infinity", bound, "a priori")
+    table.add_row("error in time", percent(evidence.error_time_domain), "force during a poke, of its largest")
+    table.add_row("error of the surface", percent(evidence.error_surface_in_band), "displacement in the band")
+    table.add_row(
+        "spectral abscissa",
+        f"{evidence.spectral_abscissa:.3g}",
+        "1/s; below 0: stable",
+    )
+    table.add_row(
+        "passivity margin",
+        f"{evidence.passivity_margin:.2g}",
+        "below 0: can give out energy",
+    )
+    table.add_row(
+        "energy given out",
+        f"{evidence.largest_energy_out_j:.2g} J",
+        "at most, in a closed poke of 1 mm",
+    )
+    resolved = evidence.resolved_frequency_hz
+    meaning = "shear waves, 6 nodes a wavelength"
+    if resolved < high:
+        meaning += f"; [yellow]the band goes to {high:g} Hz[/]"
+    table.add_row("cloud resolves", f"{resolved:.3g} Hz", meaning)
+    for index, contact in enumerate(model.contacts):
+        along = slice(3 * index, 3 * index + 3)
+        normal = np.asarray(contact.normal)
+        rest = normal @ model.static_stiffness[along, along] @ normal
+        instant = normal @ model.continuous.d[along, along] @ normal
+        table.add_row(
+            f"stiffness at '{contact.name}'",
+            f"{rest:.3g} N/m",
+            f"normal, at rest; {instant:.3g} instantly; {contact.n_nodes} nodes",
+        )
+    return table

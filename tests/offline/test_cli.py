@@ -1,0 +1,140 @@
+"""The command line as its user meets it: real processes, real files."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SLAB = """
+name = "slab"
+[geometry]
+shape = "box"
+upper_m = [0.06, 0.06, 0.03]
+counts = [7, 7, 4]
+jitter = 0.1
+[material]
+preset = "liver"
+[[fixed]]
+region = "plane"
+point_m = [0.0, 0.0, 0.0001]
+normal = [0.0, 0.0, -1.0]
+[[contact]]
+name = "tip"
+point_m = [0.03, 0.03, 0.03]
+radius_m = 0.011
+"""
+
+
+def palpate(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "palpate.cli", *arguments],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def slab(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A folder with slab.toml and the slab.npz built from it, and what the build printed."""
+    folder = tmp_path_factory.mktemp("slab")
+    (folder / "slab.toml").write_text(SLAB)
+    done = palpate("build", "slab.toml", folder=folder)
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout
+
+
+def test_build_shows_its_stages_and_the_evidence_and_writes_one_file(slab: tuple[Path, str]) -> None:
+    folder, printed = slab
+    assert sorted(p.name for p in folder.iterdir()) == ["slab.npz", "slab.toml"]
+    for words in (
+        "node cloud",
+        "modes",
+        "reduction",
+        "error in band",
+        "error at 0 Hz",
+        "passivity margin",
+        "wrote",
+    ):
+        assert words in printed
+
+
+def test_inspect_prints_what_the_file_states(slab: tuple[Path, str]) -> None:
+    folder, _ = slab
+    done = palpate("inspect", "slab.npz", "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert summary["name"] == "slab"
+    assert summary["method"] == "tbr-band"
+    assert summary["n_nodes"] == 7 * 7 * 4
+    assert summary["period_s"] == 1e-3
+    assert summary["order"] < summary["n_states_full"]
+    assert summary["evidence"]["error_in_band"] <= 0.02
+    assert summary["evidence"]["error_bound"] is None
+    assert palpate("inspect", "slab.npz", folder=folder).returncode == 0
+
+
+def test_the_same_configuration_builds_the_same_evidence(slab: tuple[Path, str]) -> None:
+    folder, _ = slab
+    assert palpate("build", "slab.toml", "-o", "again.npz", folder=folder).returncode == 0
+    first, second = (
+        json.loads(palpate("inspect", name, "--json", folder=folder).stdout)
+        for name in ("slab.npz", "again.npz")
+    )
+    (folder / "again.npz").unlink()
+    assert first["config_sha256"] == second["config_sha256"]
+    assert first["order"] == second["order"]
+    assert first["evidence"]["error_in_band"] == pytest.approx(second["evidence"]["error_in_band"], rel=0.05)
+
+
+@pytest.mark.parametrize("method", ["tbr", "modal", "modal-static"])
+def test_method_and_order_can_be_chosen_on_the_command_line(slab: tuple[Path, str], method: str) -> None:
+    folder, _ = slab
+    done = palpate(
+        "build", "slab.toml", "-o", f"{method}.npz", "--method", method, "--order", "30", folder=folder
+    )
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(palpate("inspect", f"{method}.npz", "--json", folder=folder).stdout)
+    (folder / f"{method}.npz").unlink()
+    assert summary["method"] == method
+    assert summary["order"] <= 30
+    assert (summary["evidence"]["error_bound"] is not None) == (method == "tbr")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["build", "none.toml"], "none.toml: no such configuration"),
+        (["build", "slab.toml", "--order", "1"], "reduction.order = 1"),
+        (["build", "slab.toml", "--tolerance", "200%"], "'200%'"),
+        (["build", "slab.toml", "--tolerance", "2%", "--order", "20"], "exclude each other"),
+        (["build", "slab.toml", "--method", "pod"], "reduction.method = 'pod'"),
+        (["inspect", "slab.toml"], "slab.toml: damaged or not an .npz archive"),
+        (["inspect", "none.npz"], "none.npz: no such model file"),
+    ],
+)
+def test_a_mistake_ends_in_one_plain_message_and_exit_code_2(
+    slab: tuple[Path, str], arguments: list[str], says: str
+) -> None:
+    folder, _ = slab
+    before = sorted(folder.iterdir())
+    done = palpate(*arguments, folder=folder)
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+    assert sorted(folder.iterdir()) == before
+
+
+def test_a_scene_that_can_not_be_built_leaves_no_file(slab: tuple[Path, str], tmp_path: Path) -> None:
+    elastic = SLAB.replace('preset = "liver"', 'preset = "liver"\ngamma = []\ntau_s = []')
+    (tmp_path / "elastic.toml").write_text(elastic)
+    done = palpate("build", "elastic.toml", folder=tmp_path)
+    assert done.returncode == 2
+    assert "Prony" in done.stderr or "elastic" in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["elastic.toml"]
