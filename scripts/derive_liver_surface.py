@@ -1,8 +1,9 @@
 """Derive the shipped liver surface from the segmentation in Debian's `libcgal-demo`.
 
-    apt-get download libcgal-demo=5.5.1-2 && dpkg-deb --fsys-tarfile libcgal-demo_*.deb | tar -xf -
-    find . -name 'liver.inr.gz'
-    python scripts/derive_liver_surface.py liver.inr.gz
+    apt-get download libcgal-demo=5.5.1-2
+    dpkg-deb -x libcgal-demo_5.5.1-2_all.deb package
+    tar -xzf package/usr/share/doc/libcgal-dev/data.tar.gz data/images/liver.inr.gz
+    python scripts/derive_liver_surface.py data/images/liver.inr.gz
 
 needs the extra `surfaces`. The steps: mask of label 255, blurred over 3 mm; resampled to 2 mm; surface at the level
 that keeps the volume (marching cubes); Taubin smoothing; decimation; origin to the centroid, scaled to the volume.
