@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import int32, types, uint64
+from numba import int32, typeof, types, uint64
 from numpy.typing import NDArray
 
 from palpate.model import StateSpace
@@ -33,6 +33,7 @@ from palpate_server.atomics import (
 )
 from palpate_server.clock import monotonic_ns, sleep_until
 from palpate_server.compiled import compiled, compiled_without_gil
+from palpate_server.image import Image, make_view
 from palpate_server.safety import Flags, Limits
 
 Floats = NDArray[np.float64]
@@ -172,6 +173,11 @@ def make_memory(
     )
 
 
+_NOTHING = StateSpace(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((3, 0)), np.zeros((3, 3)))
+_typeof: Callable[[object], Any] = typeof
+_memory = make_view(_typeof(make_memory(_NOTHING, 1e-3, [Limits(1.0, 1.0, 1.0, 1.0)], 1.0)))
+
+
 @compiled
 def write_command(
     commands: Commands,
@@ -203,11 +209,12 @@ def forget_command(commands: Commands, contact: int) -> None:
 
 
 @compiled
-def tick_on_arrival(m: Memory, arrival_ns: int) -> int:
+def tick_on_arrival(image: Image, arrival_ns: int) -> int:
     """A command came at `arrival_ns`: run the tick if its deadline is near, and pull the deadlines towards it.
 
-    Returns the number of ticks that ran.
+    `image` is that of a Memory. Returns the number of ticks that ran.
     """
+    m = _memory(image)
     if not compare_and_swap(m.shared, LOCK, 0, 1):
         return 0  # the deadline loop is at it; the command is in its slot for this tick or the next
     period = m.period_ns[0]
@@ -228,8 +235,9 @@ def tick_on_arrival(m: Memory, arrival_ns: int) -> int:
 
 
 @compiled_without_gil
-def run_at_deadlines(m: Memory, event_fd: int) -> None:
+def run_at_deadlines(image: Image, event_fd: int) -> None:
     """Run every tick that no command has triggered, waking whoever reads `event_fd`; until STOP is set."""
+    m = _memory(image)
     counted = 0
     while load_acquire(m.shared, STOP) == 0:
         deadline = load_acquire(m.shared, DEADLINE_NS)
@@ -261,8 +269,9 @@ def records_written(shared: Integers) -> int:
 
 
 @compiled
-def read_snapshot(m: Memory, state: Floats, applied: Floats) -> int:
+def read_snapshot(image: Image, state: Floats, applied: Floats) -> int:
     """Copy the last snapshot of the model into `state` (order,) and `applied` (n_contacts, 3); its tick, or -1."""
+    m = _memory(image)
     for _ in range(_RETRIES):
         version = begin_read(m.snapshot_version, 0)
         state[:] = m.snapshot_state

@@ -16,6 +16,7 @@ import zenoh
 
 from palpate.model import ReducedModel, StateSpace
 from palpate_server import loop, realtime, safety, telemetry, wire
+from palpate_server.image import make_image
 from palpate_server.leases import Leases, Refused
 from palpate_server.safety import Flags, Limits
 
@@ -46,6 +47,7 @@ class Server:
         self.memory = loop.make_memory(
             model.discrete, model.period_s, [limits] * len(self.names), SURFACE_PERIOD_S
         )
+        self.image = make_image(self.memory)
         self._contact_index = {name: i for i, name in enumerate(self.names)}
         self._last_sequence = [-1] * len(self.names)
         self._state = "running"
@@ -138,7 +140,7 @@ class Server:
             loop.write_command(
                 self.memory.commands, contact, command.sequence, command.client_time_ns, arrival_ns, x, y, z
             )
-        if loop.tick_on_arrival(self.memory, arrival_ns):
+        if loop.tick_on_arrival(self.image, arrival_ns):
             self._send_forces()
 
     def _why_refused(self, command: wire.Command, client: str) -> str | None:
@@ -182,7 +184,7 @@ class Server:
     def _run_deadlines(self) -> None:
         if notice := realtime.raise_priority():
             log.warning(notice)
-        loop.run_at_deadlines(self.memory, self._wake)
+        loop.run_at_deadlines(self.image, self._wake)
 
     def _send_at_deadlines(self) -> None:
         while not self._stopping.is_set():
@@ -203,7 +205,7 @@ class Server:
         applied = np.zeros((len(self.names), 3))
         last_tick = -1
         while not self._stopping.wait(SURFACE_PERIOD_S):
-            tick = loop.read_snapshot(self.memory, state, applied)
+            tick = loop.read_snapshot(self.image, state, applied)
             if tick <= last_tick or not self._surface.matching_status:
                 continue
             last_tick = tick
@@ -325,12 +327,13 @@ def warm_up(period_s: float, n_contacts: int) -> None:
     memory = loop.make_memory(system, period_s, [Limits(1.0, 1.0, 1.0, 1.0)] * n_contacts, SURFACE_PERIOD_S)
     loop.write_command(memory.commands, 0, 1, 1, 1, 0.0, 0.0, 0.0)
     loop.forget_command(memory.commands, 0)
-    loop.tick_on_arrival(memory, time.monotonic_ns())
+    image = make_image(memory)
+    loop.tick_on_arrival(image, time.monotonic_ns())
     loop.records_written(memory.shared)
-    loop.read_snapshot(memory, np.zeros(2), np.zeros((n_contacts, 3)))
+    loop.read_snapshot(image, np.zeros(2), np.zeros((n_contacts, 3)))
     loop.stop(memory.shared)
     wake = os.eventfd(0)
-    loop.run_at_deadlines(memory, wake)
+    loop.run_at_deadlines(image, wake)
     os.close(wake)
 
 

@@ -13,6 +13,7 @@ from numba import njit
 
 from palpate.model import ReducedModel, StateSpace
 from palpate_server import atomics, loop, safety
+from palpate_server.image import make_image
 from palpate_server.safety import Flags, Limits
 
 FREE = Limits(1e6, 1e12, 1e6, 1e6)  # limits that nothing here reaches
@@ -27,7 +28,7 @@ def tick(memory: loop.Memory) -> tuple[int, np.ndarray, np.ndarray, float]:
     """Run one tick on arrival; its flags, applied displacement, force and scale."""
     now = time.monotonic_ns()
     memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS // 4
-    assert loop.tick_on_arrival(memory, now) == 1
+    assert loop.tick_on_arrival(make_image(memory), now) == 1
     row = (loop.records_written(memory.shared) - 1) % loop.RECORDS
     motion = memory.record_motion[row, 0]
     flags = int(memory.record_inputs[row, 0, loop.CONTACT_FLAGS]) & ~int(Flags.LATE)
@@ -162,11 +163,11 @@ def test_an_early_command_waits_for_the_tick_and_a_second_one_replaces_it(memory
     now = time.monotonic_ns()
     memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS - 100_000
     command(memory, 1, (0.0, 0.0, 1e-3))
-    assert loop.tick_on_arrival(memory, now) == 0
+    assert loop.tick_on_arrival(make_image(memory), now) == 0
     command(memory, 2, (0.0, 0.0, 2e-3))
-    assert loop.tick_on_arrival(memory, now + PERIOD_NS * 6 // 10) == 1
+    assert loop.tick_on_arrival(make_image(memory), now + PERIOD_NS * 6 // 10) == 1
     assert memory.record_inputs[0, 0, loop.SEQUENCE] == 2
-    assert loop.tick_on_arrival(memory, now + PERIOD_NS * 7 // 10) == 0  # one tick each period
+    assert loop.tick_on_arrival(make_image(memory), now + PERIOD_NS * 7 // 10) == 0  # one tick each period
 
 
 def test_deadlines_settle_a_quarter_of_a_period_behind_steady_arrivals(memory: loop.Memory) -> None:
@@ -175,7 +176,7 @@ def test_deadlines_settle_a_quarter_of_a_period_behind_steady_arrivals(memory: l
         memory.shared[loop.DEADLINE_NS] = start + offset
         ticks = 0
         for i in range(600):
-            ticks += loop.tick_on_arrival(memory, start + i * PERIOD_NS)
+            ticks += loop.tick_on_arrival(make_image(memory), start + i * PERIOD_NS)
         phase = (memory.shared[loop.DEADLINE_NS] - start) % PERIOD_NS
         assert abs(phase - PERIOD_NS // 4) < PERIOD_NS // 50
         assert abs(ticks - 600) <= 1
@@ -184,13 +185,13 @@ def test_deadlines_settle_a_quarter_of_a_period_behind_steady_arrivals(memory: l
 def test_missed_ticks_are_made_up_for_and_too_many_are_skipped(memory: loop.Memory) -> None:
     now = time.monotonic_ns()
     memory.shared[loop.DEADLINE_NS] = now - 5 * PERIOD_NS - PERIOD_NS // 2
-    assert loop.tick_on_arrival(memory, now) == 6
+    assert loop.tick_on_arrival(make_image(memory), now) == 6
     assert memory.counters[loop.CAUGHT_UP_TICKS] == 5
     flags = memory.record_inputs[:6, 0, loop.CONTACT_FLAGS]
     np.testing.assert_array_equal(flags & int(Flags.CAUGHT_UP) > 0, [True] * 5 + [False])
 
     memory.shared[loop.DEADLINE_NS] = now - 100 * PERIOD_NS - PERIOD_NS // 2
-    assert loop.tick_on_arrival(memory, now) == loop.MAX_CATCH_UP
+    assert loop.tick_on_arrival(make_image(memory), now) == loop.MAX_CATCH_UP
     assert memory.counters[loop.SKIPPED_TICKS] == 101 - loop.MAX_CATCH_UP
     assert 0 < memory.shared[loop.DEADLINE_NS] - now < PERIOD_NS
 
@@ -200,7 +201,7 @@ def test_the_deadline_loop_steps_once_each_period_of_wall_time(
 ) -> None:
     wake = os.eventfd(0)
     memory.shared[loop.DEADLINE_NS] = start = time.monotonic_ns()
-    thread = threading.Thread(target=loop.run_at_deadlines, args=(memory, wake))
+    thread = threading.Thread(target=loop.run_at_deadlines, args=(make_image(memory), wake))
     stop_threads(memory, thread)
     thread.start()
     time.sleep(0.5)
@@ -217,7 +218,7 @@ def test_the_deadline_loop_goes_on_while_python_is_busy(
     memory: loop.Memory, stop_threads: Callable[[loop.Memory, threading.Thread], None]
 ) -> None:
     wake = os.eventfd(0)
-    thread = threading.Thread(target=loop.run_at_deadlines, args=(memory, wake))
+    thread = threading.Thread(target=loop.run_at_deadlines, args=(make_image(memory), wake))
     stop_threads(memory, thread)
     memory.shared[loop.DEADLINE_NS] = time.monotonic_ns()
     thread.start()
@@ -274,6 +275,6 @@ def test_a_snapshot_belongs_to_one_tick(make_spring_mass_model: Callable[..., Re
     for i in range(50):
         command(memory, i, (1e-3 * i, 0.0, 0.0))
         tick(memory)
-        assert loop.read_snapshot(memory, state, applied) == i
+        assert loop.read_snapshot(make_image(memory), state, applied) == i
         np.testing.assert_allclose(state, expected, rtol=1e-12, atol=1e-18)
         expected = system.dense_a() @ expected + system.b @ applied.ravel()
