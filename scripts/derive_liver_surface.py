@@ -34,7 +34,7 @@ STEP_M = 2e-3
 def main() -> None:
     parser = argparse.ArgumentParser(description="Derive the shipped liver surface from its segmentation.")
     parser.add_argument("segmentation", type=Path, help="liver.inr.gz")
-    parser.add_argument("-o", "--output", type=Path, default=Path("offline/palpate/data/liver.ply"))
+    parser.add_argument("-o", "--output", type=Path, default=Path("configs/liver.ply"))
     parser.add_argument("--triangles", type=int, default=3000)
     arguments = parser.parse_args()
 

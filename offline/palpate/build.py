@@ -31,7 +31,6 @@ from palpate.geometry.cloud import NodeCloud, TriangleSurface
 from palpate.geometry.fill import fill_surface
 from palpate.geometry.refinement import refine_surface
 from palpate.geometry.regions import ContactPatch, contact_patch, nodes_in
-from palpate.geometry.sampling import closest_point
 from palpate.geometry.shapes import ball, box_lattice
 from palpate.geometry.spacing import Refinement, SpacingField
 from palpate.geometry.surface import load_surface
@@ -180,21 +179,16 @@ def build_cloud(config: Config, folder: Path) -> NodeCloud:
             return ball(radius, spacing)
         case SurfaceGeometry(file=file, file_unit=unit, spacing_m=spacing):
             surface = load_surface(folder / file, unit_m=_UNITS_M[unit])
-            return fill_surface(surface, spacing, _refinements(config, surface))
+            return fill_surface(surface, spacing, _refinements(config))
 
 
-def _refinements(config: Config, surface: TriangleSurface) -> tuple[Refinement, ...]:
+def _refinements(config: Config) -> tuple[Refinement, ...]:
     """Finer nodes around every contact that asks for them, on rings so that its outline is round."""
     if not isinstance(config.geometry, SurfaceGeometry):
         return ()
-    refined = [t for t in config.contact if t.spacing_m is not None]
-    if not refined:
-        return ()
-    points = np.array([t.point_m for t in refined])
-    centers, _ = closest_point(points, surface.vertices, surface.triangles.astype(np.int64))
     return tuple(
-        Refinement((x, y, z), t.radius_m, t.spacing_m, growth=config.geometry.growth, rings=True)
-        for t, (x, y, z) in zip(refined, centers.tolist(), strict=True)
+        Refinement(t.point_m, t.radius_m, t.spacing_m, growth=config.geometry.growth, rings=True)
+        for t in config.contact
         if t.spacing_m is not None
     )
 
@@ -239,7 +233,7 @@ def _elastic_modes(
 
 def _view_surface(cloud: NodeCloud, config: Config) -> TriangleSurface:
     """The body's surface with triangles small enough near refined contacts to show a dimple."""
-    refinements = _refinements(config, cloud.surface)
+    refinements = _refinements(config)
     if not refinements or not isinstance(config.geometry, SurfaceGeometry):
         return cloud.surface
     field = SpacingField(config.geometry.spacing_m, refinements)

@@ -58,8 +58,8 @@ class SurfaceGeometry(_Table):
     file: str = Field(description="STL, OBJ or PLY, relative to the configuration")
     file_unit: Literal["m", "cm", "mm"] = "m"
     spacing_m: Positive
-    growth: Positive = Field(
-        default=0.4, description="growth of the spacing per metre away from a refined contact"
+    growth: float = Field(
+        default=0.3, gt=0, le=0.5, description="growth of the spacing per metre away from a refined contact"
     )
 
 

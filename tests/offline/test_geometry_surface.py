@@ -141,7 +141,7 @@ def test_a_cylinder_has_two_sharp_rims_without_corners():
 
 
 def liver_path() -> Path:
-    return Path(str(files("palpate") / "data" / "liver.ply"))
+    return Path(str(files("palpate_configs") / "liver.ply"))
 
 
 def test_the_shipped_liver_is_sound_and_as_large_as_its_segmentation():

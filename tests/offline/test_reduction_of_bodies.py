@@ -75,7 +75,7 @@ def test_the_collocated_cube_reduces_to_stable_models_inside_the_bound():
 @pytest.mark.slow
 def test_band_limited_truncation_of_the_liver_is_within_two_percent_at_order_120():
     material = PRESETS["liver"]
-    with resources.as_file(resources.files("palpate.data") / "liver.ply") as path:
+    with resources.as_file(resources.files("palpate_configs") / "liver.ply") as path:
         surface = load_surface(path)
     point, radius, band_hz = (0.02, -0.07, 0.0), 0.005, (0.0, 30.0)
     center = contact_patch(point, 0.02, fill_surface(surface, 0.03)).center_m
