@@ -16,6 +16,8 @@ from scipy.sparse import bsr_array, csr_array, diags_array
 from scipy.spatial import cKDTree
 
 from palpate.geometry.cloud import NodeCloud
+from palpate.geometry.sampling import sample_elements
+from palpate.geometry.surface import triangle_normals
 from palpate.meshfree import ShapeFunctions
 from palpate.meshfree.kernel import quartic_spline
 
@@ -45,7 +47,8 @@ def consistent_gradient(
     inverse_moments = np.linalg.inv(moments)
     rows = (4 * node[:, None] + np.arange(4)).ravel()
     fit = csr_array(((weight[:, None] * linear).ravel(), (rows, np.repeat(other, 4))), shape=(4 * n, n))
-    scale = cloud.volumes / cloud.spacing**2
+    share = cloud.volumes / cloud.spacing**2
+    scale = cloud.volumes * share
     inner = bsr_array(
         (scale[:, None, None] * inverse_moments, np.arange(n), np.arange(n + 1)), shape=(4 * n, 4 * n)
     )
@@ -62,7 +65,7 @@ def consistent_gradient(
     for axis, plain in enumerate(h.gradient):
         xi = cho_solve(factor, target[:, axis] - plain.T @ cloud.volumes, check_finite=False)
         fitted = (inverse_moments @ (fit @ xi).reshape(n, 4, 1))[:, :, 0]
-        change = weight * (xi[other] - np.sum(linear * fitted[node], axis=1)) / cloud.spacing[node] ** 2
+        change = weight * share[node] * (xi[other] - np.sum(linear * fitted[node], axis=1))
         corrected.append(csr_array((plain.data + change, plain.indices, plain.indptr), shape=plain.shape))
     return corrected[0], corrected[1], corrected[2]
 
@@ -75,39 +78,20 @@ def vector_areas(cloud: NodeCloud) -> Array:
     in proportion to itself, so that the nodes of a flat face keep its normal.
     """
     boundary = np.flatnonzero(cloud.boundary)
-    samples, areas = _surface_samples(cloud, boundary)
-    owner = boundary[cKDTree(cloud.points[boundary]).query(samples, workers=-1)[1]]
+    tree, spacing = cKDTree(cloud.points[boundary]), cloud.spacing[boundary]
+    normals, _ = triangle_normals(cloud.surface)
+    samples, triangle = sample_elements(
+        cloud.surface.vertices,
+        cloud.surface.triangles,
+        lambda points: spacing[tree.query(points, workers=-1)[1]],
+        1 / SAMPLES_A_SPACING,
+    )
+    owner = boundary[tree.query(samples.points, workers=-1)[1]]
     b = np.zeros((cloud.n_nodes, 3))
-    np.add.at(b, owner, areas)
+    np.add.at(b, owner, samples.measures[:, None] * normals[triangle])
     linear = np.column_stack([np.ones(len(boundary)), cloud.points[boundary] - cloud.points.mean(axis=0)])
     for axis, wanted in enumerate(np.eye(4)[1:] * cloud.volumes.sum()):
         component = b[boundary, axis]
         weighted = np.abs(component)[:, None] * linear
         b[boundary, axis] += weighted @ np.linalg.solve(linear.T @ weighted, wanted - linear.T @ component)
     return b
-
-
-def _surface_samples(cloud: NodeCloud, boundary: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Points (k, 3) on the triangles, spaced finer than the nodes, and the vector area (k, 3) that each stands for."""
-    corners = cloud.surface.vertices[cloud.surface.triangles]  # (n_triangles, 3, 3)
-    area = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    nearest = cKDTree(cloud.points[boundary]).query(corners.reshape(-1, 3), workers=-1)[1]
-    spacing = cloud.spacing[boundary][nearest].reshape(-1, 3).min(axis=1)
-    parts = np.maximum(1, np.ceil(SAMPLES_A_SPACING * longest / spacing)).astype(np.int64)
-    samples, areas = [], []
-    for m in np.unique(parts):
-        chosen = parts == m
-        barycentric = _subtriangle_centroids(int(m))
-        samples.append(np.einsum("sk,tkx->tsx", barycentric, corners[chosen]).reshape(-1, 3))
-        areas.append(np.repeat(area[chosen] / m**2, m**2, axis=0))
-    return np.concatenate(samples), np.concatenate(areas)
-
-
-def _subtriangle_centroids(m: int) -> Array:
-    """(m², 3), barycentric centroids of a triangle cut into m² equal ones."""
-    i, j = np.meshgrid(np.arange(m), np.arange(m), indexing="ij")
-    upright, inverted = i + j < m, i + j < m - 1
-    first = np.concatenate([i[upright] + 1 / 3, i[inverted] + 2 / 3]) / m
-    second = np.concatenate([j[upright] + 1 / 3, j[inverted] + 2 / 3]) / m
-    return np.column_stack([1 - first - second, first, second])
