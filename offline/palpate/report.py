@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import numpy as np
+from rich import box
 from rich.table import Table
 
 from palpate.model import ReducedModel
 
 
 def percent(fraction: float) -> str:
-    """A relative error in percent with two significant digits."""
-    return f"{100 * fraction:.2g} %"
+    """A relative error in percent with two significant digits, three from 100 % up."""
+    return f"{100 * fraction:.2g} %" if fraction < 0.995 else f"{100 * fraction:.0f} %"
 
 
 def evidence_table(model: ReducedModel) -> Table:
     """What the model is and how good it is, a line each."""
     evidence = model.evidence
     table = Table(
-        title=f"{model.name}: {model.method}, order {model.order}", title_justify="left", min_width=72
+        title=f"{model.name}: {model.method}, order {model.order}",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
     )
     table.add_column("evidence", no_wrap=True)
     table.add_column("value", justify="right", no_wrap=True)
     table.add_column("meaning", style="dim")
 
     low, high = evidence.band_hz
-    bound = "none for this method" if evidence.error_bound is None else percent(evidence.error_bound)
+    bound = "none" if evidence.error_bound is None else percent(evidence.error_bound)
     table.add_row(
         "states",
         f"{model.n_states_full:,} → {model.order}",
@@ -37,7 +41,7 @@ def evidence_table(model: ReducedModel) -> Table:
     table.add_row("error at 0 Hz", percent(evidence.error_static), "static force")
     table.add_row("error, H-infinity", percent(evidence.error_hinf), "of the largest response")
     table.add_row("bound, H-infinity", bound, "a priori")
-    table.add_row("error in time", percent(evidence.error_time_domain), "force during a poke, of its largest")
+    table.add_row("error in time", percent(evidence.error_time_domain), "force during a poke")
     table.add_row("error of the surface", percent(evidence.error_surface_in_band), "displacement in the band")
     table.add_row(
         "spectral abscissa",
@@ -52,12 +56,12 @@ def evidence_table(model: ReducedModel) -> Table:
     table.add_row(
         "energy given out",
         f"{evidence.largest_energy_out_j:.2g} J",
-        "at most, in a closed poke of 1 mm",
+        "at most, by a closed poke of 1 mm",
     )
     resolved = evidence.resolved_frequency_hz
-    meaning = "shear waves, 6 nodes a wavelength"
+    meaning = "shear waves, 6 nodes each"
     if resolved < high:
-        meaning += f"; [yellow]the band goes to {high:g} Hz[/]"
+        meaning += f"; [yellow]band: {high:g} Hz[/]"
     table.add_row("cloud resolves", f"{resolved:.3g} Hz", meaning)
     for index, contact in enumerate(model.contacts):
         along = slice(3 * index, 3 * index + 3)
@@ -67,6 +71,6 @@ def evidence_table(model: ReducedModel) -> Table:
         table.add_row(
             f"stiffness at '{contact.name}'",
             f"{rest:.3g} N/m",
-            f"normal, at rest; {instant:.3g} instantly; {contact.n_nodes} nodes",
+            f"at rest; instantly {instant:.3g}",
         )
     return table
