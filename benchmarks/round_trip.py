@@ -56,7 +56,7 @@ def main() -> None:
             save_model(spring_mass_model(n_modes=50), path)
         model = load_model(path)
         contact = model.contacts[0].name
-        inputs, motion = [[10**6] * 4] * len(model.contacts), [[0.1] * 7] * len(model.contacts)
+        inputs, motion = [[10**6] * 4] * len(model.contacts), [[0.1] * 8] * len(model.contacts)
         force_bytes = len(wire.encode_force(10**6, 10**15, inputs, motion))
         command_bytes = len(encode_command(contact, 10**6, 10**15))
         print(f"order {model.order}, {len(model.contacts)} contacts; ", end="")

@@ -94,20 +94,28 @@ class Connection:
             raise Refused(f"{refusal['message']} ({refusal['reason']})")
         raise ServerGone(f"no server answers for {self.prefix}/{key} at {self.endpoint}")
 
-    def acquire(self, contacts):
-        """Take contacts for ourselves alone; only then are our commands for them heard."""
-        return self.query("control/acquire", {"client": self.name, "contacts": list(contacts)})
+    def acquire(self, contacts, **wishes):
+        """Take contacts for ourselves alone; only then are our commands for them heard.
+
+        `wishes` as in docs/wire.md: device, frame, round_trip_s, device_damping_n_s_per_m. The answer has the limits
+        that hold for us, and warnings to show to the user.
+        """
+        return self.query("control/acquire", {"client": self.name, "contacts": list(contacts), **wishes})
 
     def release(self):
         return self.query("control/release", {"client": self.name})
 
-    def command(self, displacement_m):
-        """The next command: where the tips are, {contact: [x, y, z]}, m from rest, in the model frame."""
+    def command(self, displacement_m, **more):
+        """The next command: where the tips are, {contact: [x, y, z]}, m from rest, in our frame.
+
+        `more` as in docs/wire.md: velocity_m_per_s, rendered_tick.
+        """
         self.sequence += 1
         return {
             "sequence": self.sequence,
             "client_time_ns": time.monotonic_ns(),
             "displacement_m": displacement_m,
+            **more,
         }
 
     def send(self, command):

@@ -9,6 +9,7 @@ class Contract:
     """Feed it every command sent and every force received, for one contact; it keeps what broke the contract."""
 
     def __init__(self, description, contact):
+        """`description` is the answer to `describe`, `contact` the name of ours."""
         names = [c["name"] for c in description["contacts"]]
         self.index = names.index(contact)
         self.flags = description["flags"]
@@ -24,6 +25,10 @@ class Contract:
         self.largest_force_n = 0.0
         self.broken = []
         self._last = None
+
+    def agree(self, terms):
+        """The answer to `acquire`: its limits are those that hold for us."""
+        self.max_force_n = terms["limits"]["max_force_n"]
 
     def on_sent(self, command):
         self.sent[command["sequence"]] = command["client_time_ns"]

@@ -55,21 +55,29 @@ def run(connection, options):
     contact = connection.description["contacts"][0]
     contract = Contract(connection.description, contact["name"])
     inwards = [-n for n in contact["normal"]]
-    newest = {"force": 0.0, "heard": time.monotonic()}
+    newest = {"force": 0.0, "tick": None, "heard": time.monotonic()}
 
     def on_force(message, arrival_ns):
         contract.on_force(message, arrival_ns)
         # The message holds what the tip does to the tissue; the hand feels the opposite. Along the line of motion:
         force = message["force_n"][contract.index]
         newest["force"] = -sum(f * n for f, n in zip(force, inwards, strict=True))
+        newest["tick"] = message["tick"]
         newest["heard"] = time.monotonic()
 
     connection.on_force(on_force)
-    connection.acquire([contact["name"]])
+    # With a device the server watches the energy that goes through our hands, and damps what would build up.
+    terms = connection.acquire(
+        [contact["name"]], device=options.device, device_damping_n_s_per_m=options.damping_n_s_per_m
+    )
+    contract.agree(terms)
+    for warning in terms["warnings"]:
+        print(f"warning: {warning}", file=sys.stderr)
     device = SimulatedDevice(options.mass_kg, options.damping_n_s_per_m, options.hand_n_per_m)
     period = connection.description["period_s"]
     deepest = 0.0
     trouble = None
+    rendered = {}  # nothing is told before the first force is rendered
     start = time.monotonic()
     for i in range(round(options.duration_s / period)):
         wait = start + i * period - time.monotonic()
@@ -77,7 +85,14 @@ def run(connection, options):
             time.sleep(wait)
         # The tip is outside the tissue until its position is inside it; then it pushes, and nothing pulls it in.
         depth = max(device.position_m, 0.0)
-        command = connection.command({contact["name"]: [depth * n for n in inwards]})
+        # The velocity lets the server carry the motion on when a command is late; the tick tells it which of its
+        # forces acted until now, so that it can count the energy exactly although messages take time.
+        speed = device.velocity_m_per_s if depth > 0 else 0.0
+        command = connection.command(
+            {contact["name"]: [depth * n for n in inwards]},
+            velocity_m_per_s={contact["name"]: [speed * n for n in inwards]},
+            **rendered,
+        )
         contract.on_sent(command)  # before it is sent: the answer may come before `send` returns
         connection.send(command)
         # Never keep rendering what the server said long ago.
@@ -89,6 +104,7 @@ def run(connection, options):
             device.render(0.0)
             break
         device.render(newest["force"] if depth > 0 else 0.0)
+        rendered = {} if newest["tick"] is None else {"rendered_tick": newest["tick"]}
         device.move(options.reach_m * (1 - math.cos(2 * math.pi * i * period)) / 2, period)
         deepest = max(deepest, device.position_m)
     if not trouble:
@@ -122,6 +138,7 @@ def parse_options():
     parser.add_argument(
         "--zenoh-config", metavar="FILE", help="Zenoh configuration to use instead of --connect"
     )
+    parser.add_argument("--device", default="generic", help="profile whose limits are to hold (%(default)s)")
     parser.add_argument("--mass-kg", type=float, default=0.1, help="of the handle (%(default)s)")
     parser.add_argument("--damping-n-s-per-m", type=float, default=0.5, help="of the device (%(default)s)")
     parser.add_argument(

@@ -44,7 +44,7 @@ def run(connection, options):
             recording.append(message)
 
     connection.on_force(on_force)
-    connection.acquire([contact["name"]])
+    contract.agree(connection.acquire([contact["name"]]))
     lost = drive(connection, contract, contact, motion(options), options, last_force)
     if not lost:
         time.sleep(0.05)  # the last answers are still under way

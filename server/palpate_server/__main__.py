@@ -31,7 +31,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # silent unless RUST_LOG says otherwise
     limits = Limits(
-        options.max_force_n, options.max_force_rate_n_per_s, options.max_speed_m_per_s, options.workspace_m
+        options.max_force_n,
+        options.max_force_rate_n_per_s,
+        options.max_speed_m_per_s,
+        options.workspace_m,
+        0.0,
     )
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from palpate_server.frames import IDENTITY, Frame
+from palpate_server.safety import Limits
 
 
 class Refused(Exception):
@@ -13,29 +17,39 @@ class Refused(Exception):
         self.reason = reason
 
 
-class Leases:
-    """The holder of every contact. Changed by one thread alone; `holders` may be read by any."""
+@dataclass(frozen=True)
+class Terms:
+    """How a contact is held: within which limits and in which frame, from which tick on."""
 
-    def __init__(self, contacts: Sequence[str]) -> None:
+    limits: Limits
+    frame: Frame
+    since_tick: int = 0
+
+
+class Leases:
+    """The holder of every contact, and the terms. Changed by one thread alone; may be read by any."""
+
+    def __init__(self, contacts: Sequence[str], ceiling: Limits) -> None:
         self.contacts = tuple(contacts)
         self.holders: dict[str, str | None] = dict.fromkeys(contacts)
+        self.terms: dict[str, Terms] = dict.fromkeys(contacts, Terms(ceiling, IDENTITY))
 
-    def acquire(self, client: str, contacts: Iterable[str]) -> None:
-        """Give `contacts` to `client`, all or none. Raises Refused when one is unknown or another client's."""
-        wanted = tuple(contacts)
-        for name in wanted:
+    def check(self, client: str, contacts: Iterable[str]) -> None:
+        """Raises Refused when one of `contacts` is unknown or another client's."""
+        for name in contacts:
             if name not in self.holders:
                 known = ", ".join(self.contacts)
                 raise Refused("unknown_contact", f"no contact is called {name!r}: there are {known}")
             holder = self.holders[name]
             if holder is not None and holder != client:
                 raise Refused("held", f"contact {name!r} is held by client {holder!r}")
-        for name in wanted:
-            self.holders[name] = client
+
+    def held_by(self, client: str) -> tuple[str, ...]:
+        return tuple(name for name, holder in self.holders.items() if holder == client)
 
     def release(self, client: str) -> tuple[str, ...]:
         """Take every contact away from `client`; the names of those it held."""
-        held = tuple(name for name, holder in self.holders.items() if holder == client)
+        held = self.held_by(client)
         for name in held:
             self.holders[name] = None
         return held

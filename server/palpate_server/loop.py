@@ -21,7 +21,7 @@ from numba import int32, typeof, types, uint64
 from numpy.typing import NDArray
 
 from palpate.model import StateSpace
-from palpate_server import kernel, safety
+from palpate_server import frames, kernel, safety
 from palpate_server.atomics import (
     begin_read,
     begin_write,
@@ -54,12 +54,14 @@ LOCK, DEADLINE_NS, STOP, HEAD = range(4)
 # Columns of Memory.counters: written under the tick lock alone.
 TICKS, TICKS_ON_ARRIVAL, LATE_TICKS, CAUGHT_UP_TICKS, SKIPPED_TICKS, FAULTS = range(6)
 # Columns of Commands.integers; Memory.record_inputs has the age and the flags behind the first two.
-SEQUENCE, CLIENT_TIME_NS, ARRIVAL_NS = range(3)
+SEQUENCE, CLIENT_TIME_NS, ARRIVAL_NS, RENDERED_TICK = range(4)
 AGE_NS, CONTACT_FLAGS = 2, 3
 # Columns of Memory.record_times.
 START_NS, TICK_DEADLINE_NS, COMPUTE_NS, TICK_FLAGS = range(4)
-# Columns of Memory.record_motion: displacement 0:3, force 3:6, scale 6.
-SCALE = 6
+# Columns of Memory.record_motion: displacement 0:3, force 3:6, then these.
+SCALE, ENERGY_J = 6, 7
+# Columns of Memory.limits.
+MAX_FORCE, MAX_FORCE_RATE, MAX_SPEED, WORKSPACE, MAX_DAMPING = range(5)
 # Rows of Memory.histograms.
 TIMER_LATENESS, TICK_LATENESS, COMPUTE_TIME, INPUT_AGE = range(4)
 
@@ -77,12 +79,14 @@ _eventfd_write: Any = types.ExternalFunction("eventfd_write", int32(int32, uint6
 class Commands(NamedTuple):
     """The newest command of each contact, handed over under sequence locks. n = n_contacts.
 
-    versions (n,); integers (n, 3): SEQUENCE (-1: none yet), CLIENT_TIME_NS, ARRIVAL_NS; target (n, 3), m
+    versions (n,); integers (n, 4): SEQUENCE (-1: none yet), CLIENT_TIME_NS, ARRIVAL_NS, RENDERED_TICK (the tick whose
+    force the device was rendering until then, -1: not told); target (n, 3), m; velocity (n, 3), m/s
     """
 
     versions: Integers
     integers: Integers
     target: Floats
+    velocity: Floats
 
 
 class Memory(NamedTuple):
@@ -92,14 +96,19 @@ class Memory(NamedTuple):
     shared           (4,), LOCK, DEADLINE_NS, STOP, HEAD: the number of complete records
     counters         (6,)
     histograms       (4, HISTOGRAM_BINS) counts, and longest_ns (4,)
-    limits           (n, 4), the fields of safety.Limits
-    commands         what clients want; newest_integers and target: what the tick last read of it, same shapes
-    applied          (n, 3), m, the model's input; force, previous_force (n, 3), N; scale (n,)
+    limits           (n, 5), the fields of safety.Limits
+    rotation (n, 3, 3), frame_scale (n,), origin (n, 3): the holders' frames, as in frames.Frame
+    commands         what clients want; read_integers (4,), read_motion (6,): a read that may be torn; newest_integers, target, velocity: what the tick last read of it
+    position, applied, step, device_force, previous_force, rendered_force  (n, 3), m and N, in the holders' frames:
+                     where the tip is wanted, where it is, how far that is from the tick before, the force, the one
+                     before, and the one that the device was rendering
+    displacement, force  (n, 3), m and N, the model's input and output
+    scale, energy    (n,), how much of the force is given out; J that the port took in
     diagonal, cross, b_transposed, c, d, state    the discrete model, as in `kernel`
-    record_times     (RECORDS, 4), record_inputs (RECORDS, n, 4), record_motion (RECORDS, n, 7): a ring, tick t at
+    record_times     (RECORDS, 4), record_inputs (RECORDS, n, 4), record_motion (RECORDS, n, 8): a ring, tick t at
                      t % RECORDS
     snapshot_every   (1,), ticks between two snapshots
-    snapshot_version (1,), sequence lock of snapshot_tick (1,), snapshot_state (order,), snapshot_applied (n, 3)
+    snapshot_version (1,), sequence lock of snapshot_tick (1,), snapshot_state (order,), snapshot_displacement (n, 3)
     """
 
     period_ns: Integers
@@ -108,13 +117,25 @@ class Memory(NamedTuple):
     histograms: Integers
     longest_ns: Integers
     limits: Floats
+    rotation: Floats
+    frame_scale: Floats
+    origin: Floats
     commands: Commands
+    read_integers: Integers
+    read_motion: Floats
     newest_integers: Integers
     target: Floats
+    velocity: Floats
+    position: Floats
     applied: Floats
-    force: Floats
+    step: Floats
+    device_force: Floats
     previous_force: Floats
+    rendered_force: Floats
+    displacement: Floats
+    force: Floats
     scale: Floats
+    energy: Floats
     diagonal: Floats
     cross: Floats
     b_transposed: Floats
@@ -128,7 +149,7 @@ class Memory(NamedTuple):
     snapshot_version: Integers
     snapshot_tick: Integers
     snapshot_state: Floats
-    snapshot_applied: Floats
+    snapshot_displacement: Floats
 
 
 def make_memory(
@@ -138,8 +159,8 @@ def make_memory(
     n = len(limits)
     order = system.order
     period_ns = round(period_s * 1e9)
-    no_command = np.zeros((n, 3), np.int64)
-    no_command[:, SEQUENCE] = -1
+    no_command = np.zeros((n, 4), np.int64)
+    no_command[:, SEQUENCE] = no_command[:, RENDERED_TICK] = -1
     shared = np.zeros(4, np.int64)
     shared[DEADLINE_NS] = time.monotonic_ns() + period_ns
     return Memory(
@@ -149,13 +170,25 @@ def make_memory(
         histograms=np.zeros((4, HISTOGRAM_BINS), np.int64),
         longest_ns=np.zeros(4, np.int64),
         limits=np.array(limits, np.float64),
-        commands=Commands(versions=np.zeros(n, np.int64), integers=no_command, target=np.zeros((n, 3))),
+        rotation=np.tile(np.eye(3), (n, 1, 1)),
+        frame_scale=np.ones(n),
+        origin=np.zeros((n, 3)),
+        commands=Commands(np.zeros(n, np.int64), no_command, np.zeros((n, 3)), np.zeros((n, 3))),
+        read_integers=np.zeros(4, np.int64),
+        read_motion=np.zeros(6),
         newest_integers=no_command.copy(),
         target=np.zeros((n, 3)),
+        velocity=np.zeros((n, 3)),
+        position=np.zeros((n, 3)),
         applied=np.zeros((n, 3)),
-        force=np.zeros((n, 3)),
+        step=np.zeros((n, 3)),
+        device_force=np.zeros((n, 3)),
         previous_force=np.zeros((n, 3)),
+        rendered_force=np.zeros((n, 3)),
+        displacement=np.zeros((n, 3)),
+        force=np.zeros((n, 3)),
         scale=np.zeros(n),
+        energy=np.zeros(n),
         diagonal=system.diagonal.copy(),
         cross=system.cross.copy(),
         b_transposed=np.ascontiguousarray(system.b.T),
@@ -164,18 +197,18 @@ def make_memory(
         state=np.zeros(order),
         record_times=np.zeros((RECORDS, 4), np.int64),
         record_inputs=np.zeros((RECORDS, n, 4), np.int64),
-        record_motion=np.zeros((RECORDS, n, 7)),
+        record_motion=np.zeros((RECORDS, n, 8)),
         snapshot_every=np.array([max(1, round(snapshot_period_s / period_s))]),
         snapshot_version=np.zeros(1, np.int64),
         snapshot_tick=np.zeros(1, np.int64),
         snapshot_state=np.zeros(order),
-        snapshot_applied=np.zeros((n, 3)),
+        snapshot_displacement=np.zeros((n, 3)),
     )
 
 
 _NOTHING = StateSpace(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((3, 0)), np.zeros((3, 3)))
 _typeof: Callable[[object], Any] = typeof
-_memory = make_view(_typeof(make_memory(_NOTHING, 1e-3, [Limits(1.0, 1.0, 1.0, 1.0)], 1.0)))
+_memory = make_view(_typeof(make_memory(_NOTHING, 1e-3, [Limits(1.0, 1.0, 1.0, 1.0, 1.0)], 1.0)))
 
 
 @compiled
@@ -185,18 +218,19 @@ def write_command(
     sequence: int,
     client_time_ns: int,
     arrival_ns: int,
-    x: float,
-    y: float,
-    z: float,
+    rendered_tick: int,
+    target: tuple[float, float, float],
+    velocity: tuple[float, float, float],
 ) -> None:
     """Hand the newest displacement (m, finite) of a contact to the loop. One thread at a time may call this."""
     begin_write(commands.versions, contact)
     commands.integers[contact, SEQUENCE] = sequence
     commands.integers[contact, CLIENT_TIME_NS] = client_time_ns
     commands.integers[contact, ARRIVAL_NS] = arrival_ns
-    commands.target[contact, 0] = x
-    commands.target[contact, 1] = y
-    commands.target[contact, 2] = z
+    commands.integers[contact, RENDERED_TICK] = rendered_tick
+    for i in range(3):
+        commands.target[contact, i] = target[i]
+        commands.velocity[contact, i] = velocity[i]
     end_write(commands.versions, contact)
 
 
@@ -206,6 +240,51 @@ def forget_command(commands: Commands, contact: int) -> None:
     begin_write(commands.versions, contact)
     commands.integers[contact, SEQUENCE] = -1
     end_write(commands.versions, contact)
+
+
+@compiled
+def is_silent(image: Image, contact: int) -> bool:
+    """True when the force of a contact has faded to zero."""
+    return _memory(image).scale[contact] == 0.0
+
+
+@compiled
+def set_frame(image: Image, contact: int, rotation: Floats, scale: float, origin: Floats) -> int:
+    """Give a silent contact another frame, between two ticks; the tip stays where it is in the model.
+
+    rotation (3, 3), origin (3,), m. Returns the first tick that uses it.
+    """
+    m = _memory(image)
+    _take_lock(m)
+    m.rotation[contact] = rotation
+    m.frame_scale[contact] = scale
+    m.origin[contact] = origin
+    for i in range(3):
+        position = 0.0
+        for j in range(3):
+            position += rotation[j, i] * m.displacement[contact, j]
+        m.applied[contact, i] = position / scale + origin[i]
+        m.target[contact, i] = m.applied[contact, i]
+    tick = m.counters[TICKS]
+    store_release(m.shared, LOCK, 0)
+    return tick
+
+
+@compiled
+def reset(image: Image) -> None:
+    """Put the model to rest, between two ticks; every force starts from zero again."""
+    m = _memory(image)
+    _take_lock(m)
+    m.state[:] = 0.0
+    m.scale[:] = 0.0
+    store_release(m.shared, LOCK, 0)
+
+
+@compiled
+def _take_lock(m: Memory) -> None:
+    """Wait for the tick to end, some ten microseconds at most. Not for the deadline loop."""
+    while not compare_and_swap(m.shared, LOCK, 0, 1):
+        sleep_until(monotonic_ns() + _RETRY_NS)
 
 
 @compiled
@@ -269,13 +348,13 @@ def records_written(shared: Integers) -> int:
 
 
 @compiled
-def read_snapshot(image: Image, state: Floats, applied: Floats) -> int:
-    """Copy the last snapshot of the model into `state` (order,) and `applied` (n_contacts, 3); its tick, or -1."""
+def read_snapshot(image: Image, state: Floats, displacement: Floats) -> int:
+    """Copy the last snapshot of the model into `state` (order,) and `displacement` (n_contacts, 3), m; its tick, or -1."""
     m = _memory(image)
     for _ in range(_RETRIES):
         version = begin_read(m.snapshot_version, 0)
         state[:] = m.snapshot_state
-        applied[:] = m.snapshot_applied
+        displacement[:] = m.snapshot_displacement
         tick = m.snapshot_tick[0]
         if is_whole(m.snapshot_version, 0, version):
             return tick
@@ -295,15 +374,15 @@ def _run_due_ticks(m: Memory, now: int) -> None:
         deadline += (due - MAX_CATCH_UP) * period
         due = MAX_CATCH_UP
     for i in range(due):
-        _run_tick(m, deadline, i < due - 1)
+        _run_tick(m, deadline, monotonic_ns(), i < due - 1)
         deadline += period
     store_release(m.shared, DEADLINE_NS, deadline)
 
 
 @compiled
-def _run_tick(m: Memory, deadline: int, missed: bool) -> None:
-    start = monotonic_ns()
+def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
     period = m.period_ns[0]
+    period_s = period * 1e-9
     tick = m.counters[TICKS]
     row = tick % m.record_times.shape[0]
     n_contacts = m.applied.shape[0]
@@ -329,9 +408,20 @@ def _run_tick(m: Memory, deadline: int, missed: bool) -> None:
             if not fresh:
                 flags |= _HELD
             _count(m, INPUT_AGE, age)
+            safety.reconstruct(m.target[i], m.velocity[i], age, m.position[i])
         elif m.scale[i] == 0.0:
-            m.target[i] = 0.0  # nobody feels it any more: withdraw the tip, so that the tissue comes to rest
-        flags |= safety.follow(m.target[i], m.applied[i], m.limits[i, 3], m.limits[i, 2] * period * 1e-9)
+            m.position[i] = m.origin[
+                i
+            ]  # nobody feels it any more: withdraw the tip, so that the tissue comes to rest
+            m.energy[i] = 0.0
+        for j in range(3):
+            m.step[i, j] = m.applied[i, j]
+        flags |= safety.follow(
+            m.position[i], m.applied[i], m.limits[i, WORKSPACE], m.limits[i, MAX_SPEED] * period_s
+        )
+        for j in range(3):
+            m.step[i, j] = m.applied[i, j] - m.step[i, j]
+        frames.to_model(m.rotation[i], m.frame_scale[i], m.origin[i], m.applied[i], m.displacement[i])
         scale = safety.fade(m.scale[i], live, period)
         if live:
             if scale < 1.0:
@@ -347,7 +437,7 @@ def _run_tick(m: Memory, deadline: int, missed: bool) -> None:
         inputs[AGE_NS] = age
         inputs[CONTACT_FLAGS] = flags
 
-    displacement = m.applied.reshape(3 * n_contacts)
+    displacement = m.displacement.reshape(3 * n_contacts)
     kernel.output(m.c, m.d, m.state, displacement, m.force.reshape(3 * n_contacts))
     if tick % m.snapshot_every[0] == 0:
         _write_snapshot(m, tick)
@@ -365,16 +455,35 @@ def _run_tick(m: Memory, deadline: int, missed: bool) -> None:
 
     for i in range(n_contacts):
         flags = 0 if finite else _FAULT
+        force = m.device_force[i]
+        frames.to_device(m.rotation[i], m.frame_scale[i], m.force[i], force)
         for j in range(3):
-            m.force[i, j] *= m.scale[i]
-        flags |= safety.bound(m.force[i], m.previous_force[i], m.limits[i, 1] * period * 1e-9, m.limits[i, 0])
+            force[j] *= m.scale[i]
+        rendered_tick = m.newest_integers[i, RENDERED_TICK]
+        told = 0 <= rendered_tick < tick and tick - rendered_tick < m.record_times.shape[0]
+        rendered = m.record_motion[(rendered_tick if told else tick - 1) % m.record_times.shape[0], i]
+        for j in range(3):
+            m.rendered_force[i, j] = rendered[3 + j]
+        m.energy[i], limited = safety.keep_passive(
+            m.energy[i],
+            m.rendered_force[i],
+            m.step[i],
+            force,
+            m.limits[i, MAX_DAMPING] * m.scale[i],
+            period_s,
+        )
+        flags |= limited
+        flags |= safety.bound(
+            force, m.previous_force[i], m.limits[i, MAX_FORCE_RATE] * period_s, m.limits[i, MAX_FORCE]
+        )
         m.record_inputs[row, i, CONTACT_FLAGS] |= flags
         motion = m.record_motion[row, i]
         for j in range(3):
-            m.previous_force[i, j] = m.force[i, j]
+            m.previous_force[i, j] = force[j]
             motion[j] = m.applied[i, j]
-            motion[3 + j] = m.force[i, j]
+            motion[3 + j] = force[j]
         motion[SCALE] = m.scale[i]
+        motion[ENERGY_J] = m.energy[i]
 
     m.record_times[row, START_NS] = start
     m.record_times[row, TICK_DEADLINE_NS] = deadline
@@ -396,16 +505,18 @@ def _read_command(m: Memory, contact: int) -> bool:
     before = m.newest_integers[contact, SEQUENCE]
     for _ in range(_RETRIES):
         version = begin_read(commands.versions, contact)
-        sequence = commands.integers[contact, SEQUENCE]
-        client_time = commands.integers[contact, CLIENT_TIME_NS]
-        arrival = commands.integers[contact, ARRIVAL_NS]
-        x, y, z = commands.target[contact, 0], commands.target[contact, 1], commands.target[contact, 2]
+        for i in range(4):
+            m.read_integers[i] = commands.integers[contact, i]
+        for i in range(3):
+            m.read_motion[i] = commands.target[contact, i]
+            m.read_motion[3 + i] = commands.velocity[contact, i]
         if is_whole(commands.versions, contact, version):
-            m.newest_integers[contact, SEQUENCE] = sequence
-            m.newest_integers[contact, CLIENT_TIME_NS] = client_time
-            m.newest_integers[contact, ARRIVAL_NS] = arrival
+            sequence = m.read_integers[SEQUENCE]
+            m.newest_integers[contact] = m.read_integers
             if sequence >= 0:
-                m.target[contact, 0], m.target[contact, 1], m.target[contact, 2] = x, y, z
+                for i in range(3):
+                    m.target[contact, i] = m.read_motion[i]
+                    m.velocity[contact, i] = m.read_motion[3 + i]
             return sequence != before
     return False
 
@@ -415,7 +526,7 @@ def _write_snapshot(m: Memory, tick: int) -> None:
     begin_write(m.snapshot_version, 0)
     m.snapshot_tick[0] = tick
     m.snapshot_state[:] = m.state
-    m.snapshot_applied[:] = m.applied
+    m.snapshot_displacement[:] = m.displacement
     end_write(m.snapshot_version, 0)
 
 

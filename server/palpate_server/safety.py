@@ -1,7 +1,8 @@
 """What stands between a client's numbers and the model, and between the model and a hand: pure compiled functions.
 
-Each tick and contact, in this order: workspace and speed of the input; staleness of the input, which scales the
-force; slew rate of the force; its magnitude. (That numbers are finite is checked before they come here.)
+Each tick and contact, in this order: reconstruction of the input between commands; its workspace and speed; its
+staleness, which scales the force; passivity at the device's port; slew rate of the force; its magnitude. (That numbers
+are finite is checked before they come here.) Everything is in the frame of the client that holds the contact.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ Floats = NDArray[np.float64]
 HOLD_NS = 20_000_000  # so long a silent client's last displacement and force are held,
 DECAY_NS = 50_000_000  # then its force fades to zero in this time: dead after 70 ms,
 SOFT_START_NS = 200_000_000  # and comes back in this one.
+EXTRAPOLATE_NS = 5_000_000  # so far a command's velocity carries its displacement on.
 
 
 class Flags(IntFlag):
@@ -36,15 +38,17 @@ class Flags(IntFlag):
     FAULT = 256  # the model gave a force that is not finite; it was put back to rest
     LATE = 512  # the tick began more than a quarter of a period after its deadline
     CAUGHT_UP = 1024  # the tick was missed and made up for, together with a later one
+    PASSIVITY_LIMITED = 2048  # the port had given out energy; the force is damped to take it back
 
 
 class Limits(NamedTuple):
-    """Bounds for one contact; each above zero."""
+    """Bounds for one contact; each above zero, but for the damping: with zero, passivity is observed and left alone."""
 
     max_force_n: float
     max_force_rate_n_per_s: float
     max_speed_m_per_s: float
     workspace_radius_m: float
+    max_damping_n_s_per_m: float
 
 
 # The numba compiler reads module constants, not enum members.
@@ -52,6 +56,18 @@ _WORKSPACE_CLAMPED = int(Flags.WORKSPACE_CLAMPED)
 _SPEED_LIMITED = int(Flags.SPEED_LIMITED)
 _SLEW_LIMITED = int(Flags.SLEW_LIMITED)
 _FORCE_CLAMPED = int(Flags.FORCE_CLAMPED)
+_PASSIVITY_LIMITED = int(Flags.PASSIVITY_LIMITED)
+
+
+@compiled
+def reconstruct(target: Floats, velocity: Floats, age_ns: int, position: Floats) -> None:
+    """Where the tip is `age_ns` after a command: carried on with its velocity for EXTRAPOLATE_NS, then held.
+
+    target, velocity, position (3,), m and m/s. A velocity of zero is a hold from the start.
+    """
+    seconds = min(max(age_ns, 0), EXTRAPOLATE_NS) * 1e-9
+    for i in range(3):
+        position[i] = target[i] + velocity[i] * seconds
 
 
 @compiled
@@ -90,6 +106,26 @@ def fade(scale: float, live: bool, period_ns: int) -> float:
     if live:
         return min(1.0, scale + period_ns / SOFT_START_NS)
     return max(0.0, scale - period_ns / DECAY_NS)
+
+
+@compiled
+def keep_passive(
+    energy: float, rendered: Floats, step: Floats, force: Floats, max_damping: float, period_s: float
+) -> tuple[float, int]:
+    """Time-domain passivity observer and controller (Hannaford & Ryu 2002); the energy so far (J), and flags.
+
+    `rendered` (3,) is the force the device held while it moved by `step` (3,): their product is the energy that the
+    port took in, exactly, because a device holds its force between updates. When more came out than went in, `force`
+    (3,) gets a damping that takes it back, no larger than `max_damping`.
+    """
+    energy += rendered[0] * step[0] + rendered[1] * step[1] + rendered[2] * step[2]
+    square = step[0] ** 2 + step[1] ** 2 + step[2] ** 2
+    if energy >= 0.0 or square == 0.0 or max_damping == 0.0:
+        return energy, 0
+    damping = min(max_damping, -energy * period_s / square)
+    for i in range(3):
+        force[i] += damping * step[i] / period_s
+    return energy, _PASSIVITY_LIMITED
 
 
 @compiled

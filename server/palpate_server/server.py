@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import queue
 import threading
@@ -16,8 +17,10 @@ import zenoh
 
 from palpate.model import ReducedModel, StateSpace
 from palpate_server import loop, realtime, safety, telemetry, wire
+from palpate_server.devices import PROFILES, limits_for, stiffness_warnings
+from palpate_server.frames import Frame, read_frame
 from palpate_server.image import make_image
-from palpate_server.leases import Leases, Refused
+from palpate_server.leases import Leases, Refused, Terms
 from palpate_server.safety import Flags, Limits
 
 log = logging.getLogger("palpate_server")
@@ -42,7 +45,7 @@ class Server:
         self.session = session
         self.keys = keys
         self.names = [contact.name for contact in model.contacts]
-        self.leases = Leases(self.names)
+        self.leases = Leases(self.names, limits)
         self.messages = telemetry.MessageCounters()
         self.memory = loop.make_memory(
             model.discrete, model.period_s, [limits] * len(self.names), SURFACE_PERIOD_S
@@ -134,11 +137,18 @@ class Server:
             messages.refused[reason] += 1
             return
         messages.accepted += 1
-        for name, (x, y, z) in command.displacement_m.items():
+        for name, displacement in command.displacement_m.items():
             contact = self._contact_index[name]
             self._last_sequence[contact] = command.sequence
             loop.write_command(
-                self.memory.commands, contact, command.sequence, command.client_time_ns, arrival_ns, x, y, z
+                self.memory.commands,
+                contact,
+                command.sequence,
+                command.client_time_ns,
+                arrival_ns,
+                command.rendered_tick,
+                displacement,
+                command.velocity_m_per_s[name],
             )
         if loop.tick_on_arrival(self.image, arrival_ns):
             self._send_forces()
@@ -194,23 +204,21 @@ class Server:
     # Status and surface
 
     def publish_status(self) -> None:
-        status = telemetry.status(
-            self._state, time.monotonic_ns(), self.memory, self.messages, self.leases.holders
-        )
+        status = telemetry.status(self._state, time.monotonic_ns(), self.memory, self.messages, self.leases)
         self._status.put(wire.pack(status))
 
     def _publish_surfaces(self) -> None:
         surface = self.model.surface
         state = np.zeros(self.model.order)
-        applied = np.zeros((len(self.names), 3))
+        tips = np.zeros((len(self.names), 3))
         last_tick = -1
         while not self._stopping.wait(SURFACE_PERIOD_S):
-            tick = loop.read_snapshot(self.image, state, applied)
+            tick = loop.read_snapshot(self.image, state, tips)
             if tick <= last_tick or not self._surface.matching_status:
                 continue
             last_tick = tick
             displacement = surface.output @ state.astype(np.float32)
-            displacement += surface.feedthrough @ applied.ravel().astype(np.float32)
+            displacement += surface.feedthrough @ tips.ravel().astype(np.float32)
             self._surface.put(wire.encode_surface(tick, time.monotonic_ns(), displacement))
 
     # Queries and leases, one after another on a thread of their own
@@ -258,34 +266,118 @@ class Server:
             )
         assert isinstance(client, str)
         if action == "acquire":
-            return {"contacts": self._acquire(client, request.get("contacts"))}
+            return self._acquire(client, request)
         if action == "release":
-            return {"contacts": self._release(client)}
-        raise Refused("unknown_action", f"no control action is called {action!r}: there are acquire, release")
+            return {"contacts": list(self._release(client))}
+        if action == "limits":
+            return self._set_limits(client, request)
+        if action == "reset":
+            return self._reset(client)
+        known = ", ".join(wire.ACTIONS)
+        raise Refused("unknown_action", f"no control action is called {action!r}: there are {known}")
 
-    def _acquire(self, client: str, contacts: object) -> list[str]:
+    def _acquire(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
+        contacts = request.get("contacts")
         if not isinstance(contacts, list) or not contacts or not all(isinstance(c, str) for c in contacts):
             raise wire.MalformedMessage("wrong_type", f"contacts is {contacts!r}: expected a list of names")
+        try:
+            frame = read_frame(request.get("frame"))
+        except ValueError as error:
+            raise wire.MalformedMessage("wrong_type", str(error)) from error
+        device = request.get("device")
+        if device is not None and device not in PROFILES:
+            raise Refused("unknown_device", f"device is {device!r}: there are {', '.join(PROFILES)}")
+        round_trip_s = _optional_number(request, "round_trip_s")
+        damping = _optional_number(request, "device_damping_n_s_per_m")
         if self._state != "running":
             raise Refused("stopping", "the server is stopping")
-        token = self.keys.client(client)
-        alive = any(
-            reply.ok is not None for reply in self.session.liveliness().get(token, timeout=_ALIVE_TIMEOUT_S)
-        )
-        if not alive:
-            raise Refused("not_alive", f"client {client!r} has no liveliness token at {token}")
-        self.leases.acquire(client, contacts)
+        self._check_alive(client)
+        self.leases.check(client, contacts)
+
+        limits, warnings = self.limits, []
         for name in contacts:
             contact = self._contact_index[name]
-            loop.forget_command(self.memory.commands, contact)
+            if device is not None:
+                limits = limits_for(PROFILES[device], self.limits)
+                stiffness = self._instant_stiffness(contact) * frame.scale**2
+                warnings += stiffness_warnings(
+                    PROFILES[device], stiffness, self.model.period_s, round_trip_s, damping
+                )
+            self._silence(contact)
             self._last_sequence[contact] = -1
-        return contacts
+            self._set_terms(name, limits, frame)
+            self.leases.holders[name] = client
+        return {
+            "contacts": contacts,
+            "limits": limits._asdict(),
+            "frame": asdict(frame),
+            "warnings": warnings,
+        }
 
-    def _release(self, client: str) -> list[str]:
+    def _check_alive(self, client: str) -> None:
+        token = self.keys.client(client)
+        replies = self.session.liveliness().get(token, timeout=_ALIVE_TIMEOUT_S)
+        if not any(reply.ok is not None for reply in replies):
+            raise Refused("not_alive", f"client {client!r} has no liveliness token at {token}")
+
+    def _silence(self, contact: int) -> None:
+        """Let a contact's force fade to zero, as after a client that has gone, and wait for it."""
+        loop.forget_command(self.memory.commands, contact)
+        give_up = time.monotonic() + 10 * safety.DECAY_NS * 1e-9
+        while not loop.is_silent(self.image, contact):
+            if time.monotonic() > give_up:
+                raise Refused("busy", "the force did not fade in time: the server is overloaded")
+            time.sleep(self.model.period_s)
+
+    def _set_terms(self, name: str, limits: Limits, frame: Frame) -> None:
+        contact = self._contact_index[name]
+        self.memory.limits[contact] = limits
+        tick = loop.set_frame(
+            self.image, contact, np.array(frame.rotation), frame.scale, np.array(frame.origin_m)
+        )
+        self.leases.terms[name] = Terms(limits, frame, tick)
+
+    def _instant_stiffness(self, contact: int) -> float:
+        """N/m, the largest over the directions."""
+        rows = slice(3 * contact, 3 * contact + 3)
+        return float(np.linalg.norm(self.model.continuous.d[rows, rows], 2))
+
+    def _set_limits(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
+        held = self.leases.held_by(client)
+        wanted = request.get("limits")
+        if not isinstance(wanted, dict) or not wanted:
+            raise wire.MalformedMessage("wrong_type", f"limits is {wanted!r}: expected a map of numbers")
+        if not held:
+            raise Refused("not_holder", f"client {client!r} holds no contact")
+        for field in wanted:
+            if field not in Limits._fields:
+                raise Refused(
+                    "unknown_limit", f"no limit is called {field!r}: there are {', '.join(Limits._fields)}"
+                )
+            value, ceiling = _optional_number(wanted, field), getattr(self.limits, field)
+            if field != "max_damping_n_s_per_m" and not (value and value <= ceiling):
+                raise Refused("limit_too_high", f"{field} is {value}: expected above 0, at most {ceiling}")
+        for name in held:
+            terms = self.leases.terms[name]
+            limits = terms.limits._replace(**wanted)
+            self.memory.limits[self._contact_index[name]] = limits
+            self.leases.terms[name] = Terms(limits, terms.frame, terms.since_tick)
+        return {"contacts": list(held), "limits": limits._asdict()}
+
+    def _reset(self, client: str) -> dict[str, Any]:
+        for name, holder in self.leases.holders.items():
+            if holder not in (None, client):
+                raise Refused("held", f"contact {name!r} is held by client {holder!r}, who would feel it")
+        if not self.leases.held_by(client):
+            raise Refused("not_holder", f"client {client!r} holds no contact")
+        loop.reset(self.image)
+        return {}
+
+    def _release(self, client: str) -> tuple[str, ...]:
         released = self.leases.release(client)
         for name in released:
             loop.forget_command(self.memory.commands, self._contact_index[name])
-        return list(released)
+        return released
 
     def _on_liveliness(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.DELETE:
@@ -304,6 +396,7 @@ def describe(model: ReducedModel, limits: Limits, session: str) -> dict[str, Any
         "period_s": model.period_s,
         "contacts": [asdict(contact) for contact in model.contacts],
         "limits": limits._asdict(),
+        "devices": {name: asdict(profile) for name, profile in PROFILES.items()},
         "hold_s": safety.HOLD_NS * 1e-9,
         "decay_s": safety.DECAY_NS * 1e-9,
         "soft_start_s": safety.SOFT_START_NS * 1e-9,
@@ -324,17 +417,30 @@ def warm_up(period_s: float, n_contacts: int) -> None:
         np.zeros((channels, 2)),
         np.zeros((channels, channels)),
     )
-    memory = loop.make_memory(system, period_s, [Limits(1.0, 1.0, 1.0, 1.0)] * n_contacts, SURFACE_PERIOD_S)
-    loop.write_command(memory.commands, 0, 1, 1, 1, 0.0, 0.0, 0.0)
+    limits = [Limits(1.0, 1.0, 1.0, 1.0, 1.0)] * n_contacts
+    memory = loop.make_memory(system, period_s, limits, SURFACE_PERIOD_S)
+    loop.write_command(memory.commands, 0, 1, 1, 1, -1, wire.STILL, wire.STILL)
     loop.forget_command(memory.commands, 0)
     image = make_image(memory)
     loop.tick_on_arrival(image, time.monotonic_ns())
     loop.records_written(memory.shared)
+    loop.is_silent(image, 0)
+    loop.set_frame(image, 0, np.eye(3), 1.0, np.zeros(3))
+    loop.reset(image)
     loop.read_snapshot(image, np.zeros(2), np.zeros((n_contacts, 3)))
     loop.stop(memory.shared)
     wake = os.eventfd(0)
     loop.run_at_deadlines(image, wake)
     os.close(wake)
+
+
+def _optional_number(request: dict[str, Any], field: str) -> float | None:
+    value = request.get(field)
+    if value is None:
+        return None
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value < math.inf:
+        raise wire.MalformedMessage("wrong_type", f"{field} is {value!r}: expected a number, at least 0")
+    return float(value)
 
 
 def _request(query: zenoh.Query) -> dict[str, Any]:

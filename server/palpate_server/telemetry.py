@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate_server import loop
+from palpate_server.leases import Leases
 from palpate_server.safety import Flags
 from palpate_server.wire import MALFORMED, REFUSED
 
@@ -61,7 +62,7 @@ def status(
     server_time_ns: int,
     memory: loop.Memory,
     messages: MessageCounters,
-    holders: Mapping[str, str | None],
+    leases: Leases,
 ) -> dict[str, Any]:
     """The status message; `state` is "running" or "stopping"."""
     ticks = memory.counters.tolist()
@@ -89,7 +90,13 @@ def status(
         "malformed": dict(messages.malformed),
         "unsent_forces": messages.unsent_forces,
         "contacts": {
-            name: {"holder": holder, "success_rate": recent_success_rate(memory, index)}
-            for index, (name, holder) in enumerate(holders.items())
+            name: {
+                "holder": holder,
+                "success_rate": recent_success_rate(memory, index),
+                "limits": leases.terms[name].limits._asdict(),
+                "frame": asdict(leases.terms[name].frame),
+                "since_tick": leases.terms[name].since_tick,
+            }
+            for index, (name, holder) in enumerate(leases.holders.items())
         },
     }

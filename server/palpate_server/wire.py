@@ -17,12 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 SCHEMA_VERSION = 1
+ACTIONS = ("acquire", "release", "limits", "reset")  # of control queries
 ENCODING = "application/msgpack;palpate.v1"
 MAX_COMMAND_BYTES = 4096
 MAX_REQUEST_BYTES = 16384
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _MAX_INT64 = 2**63 - 1
+
+Vector = tuple[float, float, float]
+STILL: Vector = (0.0, 0.0, 0.0)
 
 
 class MalformedMessage(ValueError):
@@ -90,11 +94,17 @@ class Keys:
 
 @dataclass(frozen=True)
 class Command:
-    """Where a client's tool tips are: displacement of named contacts from rest, m, in the model frame."""
+    """Where a client's tool tips are: displacement and velocity of named contacts, in the client's frame.
+
+    velocity_m_per_s has exactly the contacts of displacement_m; rendered_tick is the tick whose force the device was
+    rendering until now, -1 when the client does not tell.
+    """
 
     sequence: int
     client_time_ns: int
-    displacement_m: Mapping[str, tuple[float, float, float]]
+    displacement_m: Mapping[str, Vector]
+    velocity_m_per_s: Mapping[str, Vector]
+    rendered_tick: int = -1
 
 
 def is_name(text: object) -> bool:
@@ -131,18 +141,32 @@ def decode_command(payload: bytes) -> Command:
     Raises MalformedMessage. Fields that are not known are ignored, so that the schema can grow.
     """
     message = unpack_map(payload, MAX_COMMAND_BYTES)
-    displacement = _field(message, "displacement_m", dict)
+    displacement = _vectors(message, "displacement_m")
     if not displacement:
         raise MalformedMessage("wrong_shape", "displacement_m is empty: expected at least one contact")
+    velocity = dict.fromkeys(displacement, STILL)
+    if "velocity_m_per_s" in message:
+        given = _vectors(message, "velocity_m_per_s")
+        if not given.keys() <= displacement.keys():
+            raise MalformedMessage(
+                "wrong_shape", "velocity_m_per_s names contacts that displacement_m does not"
+            )
+        velocity |= given
     return Command(
         sequence=_count(message, "sequence"),
         client_time_ns=_count(message, "client_time_ns"),
-        displacement_m={str(name): _vector(name, vector) for name, vector in displacement.items()},
+        displacement_m=displacement,
+        velocity_m_per_s=velocity,
+        rendered_tick=_count(message, "rendered_tick") if "rendered_tick" in message else -1,
     )
 
 
 def is_finite(command: Command) -> bool:
-    return all(math.isfinite(sum(map(abs, vector))) for vector in command.displacement_m.values())
+    for vectors in (command.displacement_m, command.velocity_m_per_s):
+        for x, y, z in vectors.values():
+            if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+                return False
+    return True
 
 
 def encode_force(
@@ -154,7 +178,7 @@ def encode_force(
     """One tick's answer; lists run over the contacts in the order of the describe reply.
 
     inputs  a row a contact: sequence, client_time_ns, age_ns (all -1 without a command), flags
-    motion  a row a contact: displacement x y z (m), force x y z (N), force scale
+    motion  a row a contact: displacement x y z (m), force x y z (N), force scale, energy (J)
     """
     return msgpack.packb(
         {
@@ -167,6 +191,7 @@ def encode_force(
             "displacement_m": [row[0:3] for row in motion],
             "force_n": [row[3:6] for row in motion],
             "force_scale": [row[6] for row in motion],
+            "energy_j": [row[7] for row in motion],
         }
     )
 
@@ -214,13 +239,19 @@ def _count(message: Mapping[str, Any], name: str) -> int:
     return int(value)
 
 
-def _vector(name: object, value: object) -> tuple[float, float, float]:
+def _vectors(message: Mapping[str, Any], field: str) -> dict[str, Vector]:
+    return {name: _vector(field, name, value) for name, value in _field(message, field, dict).items()}
+
+
+def _vector(field: str, name: object, value: object) -> Vector:
     if type(value) is not list or len(value) != 3:
-        raise MalformedMessage("wrong_shape", f"displacement_m of {name!r}: expected 3 numbers")
+        raise MalformedMessage("wrong_shape", f"{field} of {name!r}: expected 3 numbers")
+    x, y, z = value
+    if type(x) is float and type(y) is float and type(z) is float:
+        return x, y, z
     for number in value:
         if type(number) is not float and type(number) is not int:
             raise MalformedMessage(
-                "wrong_type", f"displacement_m of {name!r} holds a {type(number).__name__}: expected numbers"
+                "wrong_type", f"{field} of {name!r} holds a {type(number).__name__}: expected numbers"
             )
-    x, y, z = value
     return float(x), float(y), float(z)

@@ -253,6 +253,52 @@ def test_every_refusal_carries_its_reason(
         assert refusal["message"]
 
 
+def test_a_device_brings_its_limits_its_frame_and_warnings(
+    serve: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve()
+    with connect(served.endpoint) as client:
+        request = {"client": client.name, "contacts": ["tip"], "device": "touch"}
+        request |= {"round_trip_s": 2e-3, "device_damping_n_s_per_m": 0.01, "frame": {"scale": 2.0}}
+        granted, terms = client.query("control/acquire", request)
+        assert granted
+        assert terms["limits"]["max_force_n"] == 3.3
+        assert terms["frame"]["scale"] == 2.0
+        assert any("damping" in warning for warning in terms["warnings"])
+        status = client.next_status()["contacts"]["tip"]
+        assert status["holder"] == client.name
+        assert status["limits"] == terms["limits"]
+        assert status["frame"]["scale"] == 2.0
+
+        granted, refusal = client.query("control/acquire", request | {"device": "hammer"})
+        assert (granted, refusal["reason"]) == (False, "unknown_device")
+        granted, refusal = client.query("control/acquire", request | {"frame": {"scale": -1}})
+        assert (granted, refusal["reason"]) == (False, "wrong_type")
+
+        limits = {"client": client.name, "limits": {"max_force_n": 1.5}}
+        granted, answer = client.query("control/limits", limits)
+        assert granted
+        assert answer["limits"] == terms["limits"] | {"max_force_n": 1.5}
+        granted, refusal = client.query("control/limits", limits | {"limits": {"max_force_n": 11.0}})
+        assert (granted, refusal["reason"]) == (False, "limit_too_high")
+        granted, refusal = client.query("control/limits", limits | {"limits": {"max_torque": 1.0}})
+        assert (granted, refusal["reason"]) == (False, "unknown_limit")
+
+
+def test_only_who_is_alone_may_reset_the_model(
+    serve: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve(n_contacts=2)
+    with connect(served.endpoint) as first, connect(served.endpoint) as second:
+        granted, refusal = first.query("control/reset", {"client": first.name})
+        assert (granted, refusal["reason"]) == (False, "not_holder")
+        assert first.acquire("tip")[0]
+        assert first.query("control/reset", {"client": first.name})[0]
+        assert second.acquire("tip1")[0]
+        granted, refusal = first.query("control/reset", {"client": first.name})
+        assert (granted, refusal["reason"]) == (False, "held")
+
+
 def test_describe_and_geometry_say_what_the_model_is(
     serve: Callable[..., Any], connect: Callable[..., Any]
 ) -> None:

@@ -16,12 +16,14 @@ from palpate_server import atomics, loop, safety
 from palpate_server.image import make_image
 from palpate_server.safety import Flags, Limits
 
-FREE = Limits(1e6, 1e12, 1e6, 1e6)  # limits that nothing here reaches
+FREE = Limits(1e6, 1e12, 1e6, 1e6, 0.0)  # limits that nothing here reaches
 PERIOD_NS = 1_000_000
 
 
 def command(memory: loop.Memory, sequence: int, target: tuple[float, float, float], age_ns: int = 0) -> None:
-    loop.write_command(memory.commands, 0, sequence, 7, time.monotonic_ns() - age_ns, *target)
+    loop.write_command(
+        memory.commands, 0, sequence, 7, time.monotonic_ns() - age_ns, -1, target, (0.0, 0.0, 0.0)
+    )
 
 
 def tick(memory: loop.Memory) -> tuple[int, np.ndarray, np.ndarray, float]:
@@ -159,6 +161,74 @@ def test_a_model_that_gives_nan_is_put_to_rest_and_counted(memory: loop.Memory) 
     assert np.all(np.isfinite(force))
 
 
+def test_commands_and_forces_are_in_the_holders_frame(
+    memory: loop.Memory, make_spring_mass_model: Callable[..., ReducedModel]
+) -> None:
+    system = make_spring_mass_model().discrete
+    rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    scale, origin = 2.0, np.array([0.1, 0.0, 0.0])
+    loop.set_frame(make_image(memory), 0, rotation, scale, origin)
+    state = np.zeros(system.order)
+    for i in range(300):
+        position = origin + 1e-3 * np.sin(0.1 * i) * np.array([1.0, 0.5, -0.2])
+        command(memory, i, tuple(position))
+        _, applied, force, fade = tick(memory)
+        np.testing.assert_allclose(applied, position)
+        displacement = scale * rotation @ (applied - origin)
+        expected = scale * rotation.T @ (system.c @ state + system.d @ displacement)
+        state = system.dense_a() @ state + system.b @ displacement
+        np.testing.assert_allclose(force, fade * expected, rtol=0, atol=1e-11)
+
+
+def test_another_frame_leaves_the_tip_where_it_is_in_the_model(memory: loop.Memory) -> None:
+    for i in range(10):
+        command(memory, i, (1e-3, 2e-3, 3e-3))
+        tick(memory)
+    rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    loop.set_frame(make_image(memory), 0, rotation, 0.5, np.array([0.1, 0.2, 0.3]))
+    before = memory.displacement.copy()
+    command(memory, 10, tuple(memory.applied[0]))
+    tick(memory)
+    np.testing.assert_allclose(memory.displacement, before, atol=1e-15)
+
+
+def test_a_velocity_carries_the_displacement_on_between_commands(memory: loop.Memory) -> None:
+    now = time.monotonic_ns()
+    loop.write_command(memory.commands, 0, 1, 7, now - 4_000_000, -1, (1e-3, 0.0, 0.0), (0.1, 0.0, 0.0))
+    _, applied, *_ = tick(memory)
+    assert 1.4e-3 <= applied[0] <= 1.5e-3  # 4 ms at 0.1 m/s, and no more than 5 ms
+
+
+def test_energy_counts_the_force_that_the_device_was_rendering(memory: loop.Memory) -> None:
+    forces, positions = [], []
+    expected = 0.0
+    for i in range(100):
+        position = (0.0, 0.0, 1e-3 * np.sin(0.2 * i))
+        rendered = i - 3 if i >= 3 else -1  # a device that is three ticks behind
+        now = time.monotonic_ns()
+        loop.write_command(memory.commands, 0, i, 7, now, rendered, position, (0.0, 0.0, 0.0))
+        _, applied, force, _ = tick(memory)
+        if i:
+            step = applied[2] - positions[-1]
+            expected += (forces[rendered] if rendered >= 0 else forces[-1]) * step
+        forces.append(force[2])
+        positions.append(applied[2])
+    row = (loop.records_written(memory.shared) - 1) % loop.RECORDS
+    np.testing.assert_allclose(memory.record_motion[row, 0, loop.ENERGY_J], expected, rtol=1e-9)
+
+
+def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(memory: loop.Memory) -> None:
+    for i in range(250):
+        command(memory, i, (0.0, 0.0, 1e-3))
+        tick(memory)
+    loop.reset(make_image(memory))
+    np.testing.assert_array_equal(memory.state, 0)
+    command(memory, 250, (0.0, 0.0, 1e-3))
+    flags, *_, scale = tick(memory)
+    assert flags & Flags.SOFT_START
+    assert scale < 0.01
+
+
 def test_an_early_command_waits_for_the_tick_and_a_second_one_replaces_it(memory: loop.Memory) -> None:
     now = time.monotonic_ns()
     memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS - 100_000
@@ -234,7 +304,8 @@ def test_the_deadline_loop_goes_on_while_python_is_busy(
 @njit(nogil=True)
 def _write_pairs(commands: loop.Commands, n: int) -> None:
     for i in range(n):
-        loop.write_command(commands, 0, i, i, i, float(i), float(i), float(i))
+        pair = (float(i), float(i), float(i))
+        loop.write_command(commands, 0, i, i, i, -1, pair, pair)
 
 
 @njit(nogil=True)

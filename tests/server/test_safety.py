@@ -72,3 +72,52 @@ def test_a_silent_client_is_faded_out_linearly_and_faded_in_again_more_slowly() 
 def test_hold_and_decay_together_leave_room_below_a_tenth_of_a_second() -> None:
     assert safety.HOLD_NS == 20_000_000
     assert safety.HOLD_NS + safety.DECAY_NS < 100_000_000
+
+
+@settings(deadline=None)
+@given(target=vector, velocity=vector, age_ns=st.integers(0, 10**9))
+def test_a_command_is_carried_on_with_its_velocity_for_a_bounded_time(
+    target: NDArray[np.float64], velocity: NDArray[np.float64], age_ns: int
+) -> None:
+    position = np.empty(3)
+    safety.reconstruct(target, velocity, age_ns, position)
+    seconds = min(age_ns, safety.EXTRAPOLATE_NS) * 1e-9
+    np.testing.assert_allclose(position, target + velocity * seconds, rtol=1e-12, atol=1e-9)
+
+
+def test_a_passive_spring_is_left_alone_and_its_energy_is_counted_exactly() -> None:
+    stiffness, period = 100.0, 1e-3
+    energy, position, rendered = 0.0, 0.0, np.zeros(3)
+    for depth in np.linspace(0, 0.01, 200)[1:]:
+        step = np.array([0.0, 0.0, depth - position])
+        force = np.array([0.0, 0.0, stiffness * depth])
+        energy, flags = safety.keep_passive(energy, rendered, step, force, 1.0, period)
+        assert flags == 0
+        np.testing.assert_array_equal(force, [0.0, 0.0, stiffness * depth])
+        rendered, position = force, depth
+    # A held force lags by a step: the sum is the integral of the spring less half a step of the final force.
+    step_m = 0.01 / 199
+    expected = 0.5 * stiffness * 0.01**2 - 0.5 * stiffness * 0.01 * step_m
+    assert math.isclose(energy, expected, rel_tol=1e-9)
+
+
+def test_energy_that_came_out_is_taken_back_by_a_bounded_damping() -> None:
+    period, max_damping = 1e-3, 5.0
+    step = np.array([1e-4, 0.0, 0.0])
+    force = np.zeros(3)
+    energy, flags = safety.keep_passive(-1e-9, np.zeros(3), step, force, max_damping, period)
+    assert flags == Flags.PASSIVITY_LIMITED
+    # The next step like this one takes back exactly what is missing.
+    energy, flags = safety.keep_passive(energy, force.copy(), step, np.zeros(3), max_damping, period)
+    assert math.isclose(energy, 0.0, abs_tol=1e-18)
+
+    force = np.zeros(3)
+    safety.keep_passive(-1.0, np.zeros(3), step, force, max_damping, period)
+    np.testing.assert_allclose(force, max_damping * step / period)
+
+
+def test_without_allowed_damping_passivity_is_only_observed() -> None:
+    force = np.ones(3)
+    energy, flags = safety.keep_passive(-1.0, np.ones(3), np.ones(3), force, 0.0, 1e-3)
+    assert (energy, flags) == (2.0, 0)
+    np.testing.assert_array_equal(force, 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from pathlib import Path
@@ -27,7 +28,7 @@ json_like = st.recursive(
 
 def test_a_command_is_read_as_it_was_meant() -> None:
     command = wire.decode_command(msgpack.packb(GOOD))
-    assert command == wire.Command(3, 5, {"tip": (0.0, 1e-3, -2.0)})
+    assert command == wire.Command(3, 5, {"tip": (0.0, 1e-3, -2.0)}, {"tip": wire.STILL})
     assert wire.is_finite(command)
 
 
@@ -57,6 +58,9 @@ def test_unknown_fields_are_ignored_so_that_the_schema_can_grow() -> None:
         (msgpack.packb(GOOD | {"displacement_m": {"tip": [0, 0, 0, 0]}}), "wrong_shape"),
         (msgpack.packb(GOOD | {"displacement_m": {"tip": [0, 0, "0"]}}), "wrong_type"),
         (msgpack.packb(GOOD | {"displacement_m": {"tip": [0, 0, None]}}), "wrong_type"),
+        (msgpack.packb(GOOD | {"velocity_m_per_s": {"tip": [0, 0]}}), "wrong_shape"),
+        (msgpack.packb(GOOD | {"velocity_m_per_s": {"other": [0, 0, 0]}}), "wrong_shape"),
+        (msgpack.packb(GOOD | {"rendered_tick": -1}), "wrong_type"),
     ],
 )
 def test_a_malformed_command_is_named_by_what_is_wrong(payload: bytes, reason: str) -> None:
@@ -106,7 +110,7 @@ def test_names_that_could_change_a_key_expression_are_refused(name: object) -> N
 
 
 def test_forces_carry_numbers_unchanged() -> None:
-    motion = [[0.1, 0.2, 0.3, 1 / 3, -2 / 3, 1e-300, 0.5]]
+    motion = [[0.1, 0.2, 0.3, 1 / 3, -2 / 3, 1e-300, 0.5, 0.25]]
     message = msgpack.unpackb(wire.encode_force(9, 10, [[1, 2, 3, 4]], motion))
     assert message["force_n"] == [motion[0][3:6]]
     assert message["displacement_m"] == [motion[0][0:3]]
@@ -160,12 +164,17 @@ def test_the_page_lists_the_keys_of_the_code() -> None:
 
 
 def test_the_page_lists_exactly_the_fields_of_a_force() -> None:
-    message = msgpack.unpackb(wire.encode_force(0, 0, [[0] * 4], [[0.0] * 7]))
+    message = msgpack.unpackb(wire.encode_force(0, 0, [[0] * 4], [[0.0] * 8]))
     assert [row[0].strip("`") for row in _table("Force")] == list(message)
 
 
 def test_the_page_lists_exactly_the_fields_of_a_command() -> None:
-    assert [row[0].strip("`") for row in _table("Command")] == list(GOOD)
+    fields = [row[0].strip("`") for row in _table("Command")]
+    assert fields == [field.name for field in dataclasses.fields(wire.Command)]
+
+
+def test_the_page_lists_exactly_the_control_actions_of_the_code() -> None:
+    assert [row[0].strip("`") for row in _table("Control")] == list(wire.ACTIONS)
 
 
 def test_the_page_names_the_schema_version_the_encoding_and_the_size_limit() -> None:

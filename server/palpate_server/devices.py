@@ -1,0 +1,78 @@
+"""What common haptic devices can bear, and whether a model is too stiff for one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from palpate_server.safety import Limits
+
+_CHAI3D = "CHAI3D 3 device specifications, github.com/chai3d/chai3d, src/devices"
+
+
+@dataclass(frozen=True)
+class DeviceProfile:
+    """Bounds for what a device renders; max_stiffness and max_damping are the largest recommended ones at 1 kHz."""
+
+    name: str
+    max_force_n: float
+    max_stiffness_n_per_m: float
+    max_damping_n_s_per_m: float
+    workspace_radius_m: float
+    source: str
+
+
+PROFILES = {
+    profile.name: profile
+    for profile in (
+        DeviceProfile("generic", 3.0, 700.0, 4.0, 0.1, "none: below every device here"),
+        DeviceProfile("touch", 3.3, 700.0, 5.0, 0.10, f"{_CHAI3D}: PHANTOM Omni, the Touch's former name"),
+        DeviceProfile("phantom-omni", 3.3, 700.0, 5.0, 0.10, _CHAI3D),
+        DeviceProfile("phantom-desktop", 7.9, 1000.0, 5.0, 0.10, _CHAI3D),
+        DeviceProfile("phantom-premium-1.5", 8.5, 800.0, 5.0, 0.12, _CHAI3D),
+        DeviceProfile("phantom-premium-3.0", 22.0, 1000.0, 5.0, 0.25, _CHAI3D),
+        DeviceProfile("omega", 12.0, 5000.0, 30.0, 0.075, f"{_CHAI3D}: omega.3, omega.6, omega.7"),
+        DeviceProfile("delta", 20.0, 5000.0, 30.0, 0.15, f"{_CHAI3D}: delta.3, delta.6"),
+        DeviceProfile("sigma", 12.0, 4000.0, 30.0, 0.075, f"{_CHAI3D}: sigma.7"),
+        DeviceProfile("falcon", 8.0, 3000.0, 20.0, 0.04, _CHAI3D),
+        DeviceProfile("inverse3", 10.0, 1000.0, 6.0, 0.15, "Haply's CHAI3D device class for the Inverse3"),
+    )
+}
+
+
+def limits_for(profile: DeviceProfile, ceiling: Limits) -> Limits:
+    """The tighter of the device's and the server's bounds; the passivity controller may damp as the device can."""
+    return ceiling._replace(
+        max_force_n=min(ceiling.max_force_n, profile.max_force_n),
+        workspace_radius_m=min(ceiling.workspace_radius_m, profile.workspace_radius_m),
+        max_damping_n_s_per_m=profile.max_damping_n_s_per_m,
+    )
+
+
+def stiffness_warnings(
+    profile: DeviceProfile,
+    stiffness_n_per_m: float,
+    period_s: float,
+    round_trip_s: float | None,
+    damping_n_s_per_m: float | None,
+) -> list[str]:
+    """Why a stiffness (the model's instant one, at the device) may not be rendered stably; empty when nothing is wrong.
+
+    Colgate & Schenkel (1997): a sampled spring K is passive on a device with damping b when b > K T / 2 (the model adds
+    no damping of its own here). A delay of the force counts like so much more of the sampling time.
+    """
+    warnings = []
+    if stiffness_n_per_m > profile.max_stiffness_n_per_m:
+        warnings.append(
+            f"the model's instant stiffness is {stiffness_n_per_m:.3g} N/m, "
+            f"{profile.name} is good for {profile.max_stiffness_n_per_m:.3g} N/m"
+        )
+    if damping_n_s_per_m is not None:
+        delay = round_trip_s if round_trip_s is not None else 0.0
+        needed = stiffness_n_per_m * (period_s / 2 + delay)
+        if damping_n_s_per_m <= needed:
+            warnings.append(
+                f"a device damping of {damping_n_s_per_m:.3g} N s/m is not above the {needed:.3g} N s/m that "
+                f"{stiffness_n_per_m:.3g} N/m need at a period of {period_s * 1e3:.3g} ms "
+                f"and a round trip of {delay * 1e3:.3g} ms: it may vibrate"
+            )
+    return warnings

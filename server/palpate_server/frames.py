@@ -1,0 +1,94 @@
+"""From a device's frame to the model's and back: the one place where the two meet."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_server.compiled import compiled
+
+Floats = NDArray[np.float64]
+
+_ORTHONORMAL = 1e-6
+
+
+@dataclass(frozen=True)
+class Frame:
+    """displacement in the model = scale · rotation · (device position - origin_m).
+
+    rotation  (3, 3) rows, orthonormal, device axes to model axes
+    scale     above 0: how much larger motion is in the model than at the device
+    origin_m  the device position at which the tip is at rest on the undeformed surface
+
+    Forces go back as scale · rotation^T · force, so that power is the same on both sides: the frame neither adds
+    energy to a device nor takes any.
+    """
+
+    rotation: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    scale: float = 1.0
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+IDENTITY = Frame()
+
+
+def read_frame(value: object) -> Frame:
+    """A frame from a message's map; fields that are missing are those of the identity.
+
+    Raises ValueError naming the field, its value and what was expected.
+    """
+    if value is None:
+        return IDENTITY
+    if not isinstance(value, dict):
+        raise ValueError(f"frame is {value!r}: expected a map with rotation, scale, origin_m")
+    unknown = set(value) - {"rotation", "scale", "origin_m"}
+    if unknown:
+        raise ValueError(
+            f"frame has {', '.join(sorted(map(str, unknown)))}: expected rotation, scale, origin_m"
+        )
+    rows = value.get("rotation", IDENTITY.rotation)
+    if not (isinstance(rows, list | tuple) and len(rows) == 3):
+        raise ValueError(f"frame rotation is {rows!r}: expected 3 rows of 3 numbers")
+    rotation = tuple(_three("rotation row", row) for row in rows)
+    matrix = np.array(rotation)
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(matrix) < 0:
+        raise ValueError(f"frame rotation is {rows!r}: expected an orthonormal, right-handed matrix")
+    scale = value.get("scale", 1.0)
+    if not (_is_number(scale) and scale > 0):
+        raise ValueError(f"frame scale is {scale!r}: expected a number above 0")
+    return Frame(rotation, float(scale), _three("origin_m", value.get("origin_m", (0.0, 0.0, 0.0))))
+
+
+def _three(name: str, value: Any) -> tuple[float, float, float]:
+    if not (isinstance(value, list | tuple) and len(value) == 3 and all(_is_number(v) for v in value)):
+        raise ValueError(f"frame {name} is {value!r}: expected 3 finite numbers")
+    x, y, z = value
+    return float(x), float(y), float(z)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+@compiled
+def to_model(rotation: Floats, scale: float, origin: Floats, position: Floats, displacement: Floats) -> None:
+    """Write the model displacement (3,) of a device position (3,) into `displacement`, m."""
+    for i in range(3):
+        total = 0.0
+        for j in range(3):
+            total += rotation[i, j] * (position[j] - origin[j])
+        displacement[i] = scale * total
+
+
+@compiled
+def to_device(rotation: Floats, scale: float, model_force: Floats, force: Floats) -> None:
+    """Write the device force (3,) of a model force (3,) into `force`, N."""
+    for i in range(3):
+        total = 0.0
+        for j in range(3):
+            total += rotation[j, i] * model_force[j]
+        force[i] = scale * total
