@@ -1,18 +1,35 @@
-"""Reduction of a viscoelastic body to the few states that run at 1 kHz, and the evidence for them."""
+"""Reductions of linear systems, of viscoelastic bodies above all, and the evidence for them."""
 
+from palpate.reduction.errors import ReductionError
 from palpate.reduction.evidence import measure
-from palpate.reduction.methods import METHODS, Method, Reduction, ReductionError, reduce
+from palpate.reduction.hankel_optimal import hankel_optimal
+from palpate.reduction.linear_system import LinearSystem
+from palpate.reduction.methods import METHODS, Method, Reduction, reduce
 from palpate.reduction.sampling import discretise
 from palpate.reduction.surface import SurfaceOutput, fit_surface_output
+from palpate.reduction.truncation import (
+    ReducedSystem,
+    balanced_truncation,
+    band_limited_truncation,
+    modal_truncation,
+    singular_perturbation_balancing,
+)
 
 __all__ = [
     "METHODS",
+    "LinearSystem",
     "Method",
+    "ReducedSystem",
     "Reduction",
     "ReductionError",
     "SurfaceOutput",
+    "balanced_truncation",
+    "band_limited_truncation",
     "discretise",
     "fit_surface_output",
+    "hankel_optimal",
     "measure",
+    "modal_truncation",
     "reduce",
+    "singular_perturbation_balancing",
 ]

@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from palpate.diagonal_system import DiagonalSystem
+from palpate.reduction.balancing import Gramians, missing_in_sum
 
 Array = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ class RealForm:
 
     decay, rotation  (n_states,): A x = decay * x + rotation * x[partner]
     partner          (n_states,), the other state of a pair; the state itself for a real pole
-    b (n_states, n_inputs), c (n_outputs, n_states)
+    b (n_states, n_inputs), c (n_outputs, n_states), d (n_outputs, n_inputs)
     signature        (n_states,), +-1: diag(signature) A^T diag(signature) = A; for a symmetric system also
                      C = B^T diag(signature)
     """
@@ -34,11 +35,16 @@ class RealForm:
     partner: NDArray[np.intp]
     b: Array
     c: Array
+    d: Array
     signature: Array
 
     def apply(self, x: Array) -> Array:
         """A x for x (n_states, k)."""
         return self.decay[:, None] * x + self.rotation[:, None] * x[self.partner]
+
+    def mass(self, x: Array) -> Array:
+        """E x = x."""
+        return x
 
 
 @dataclass(frozen=True)
@@ -75,7 +81,7 @@ def real_form(system: DiagonalSystem) -> RealForm:
     signature[real] = np.where(np.sum(rows.imag**2, axis=1) > np.sum(rows.real**2, axis=1), -1.0, 1.0)
     b = _in_real_coordinates(system, system.b)
     c = (_in_real_coordinates(system, system.c.T) * signature[:, None]).T
-    return RealForm(decay, rotation, partner, b, c, signature)
+    return RealForm(decay, rotation, partner, b, c, system.d, signature)
 
 
 def controllability_factor(system: DiagonalSystem, tolerance: float) -> GramianFactor:
@@ -96,6 +102,19 @@ def observability_factor(system: DiagonalSystem, tolerance: float) -> GramianFac
     signature = real_form(system).signature
     dual = _cauchy_factor(system, np.ascontiguousarray(system.c.T), tolerance)
     return GramianFactor(signature[:, None] * dual.factor, dual.trace, dual.residual)
+
+
+def gramians(system: DiagonalSystem, tolerance: float) -> Gramians:
+    """Both factors; of a symmetric system (C = B^T, Q = S P S with the signature S) the second comes with the first."""
+    control = controllability_factor(system, tolerance)
+    if system.is_symmetric:
+        observe = GramianFactor(
+            real_form(system).signature[:, None] * control.factor, control.trace, control.residual
+        )
+    else:
+        observe = observability_factor(system, tolerance)
+    missing = missing_in_sum((control.trace, control.residual), (observe.trace, observe.residual))
+    return Gramians(control.factor, observe.factor, missing, system.is_symmetric)
 
 
 def band_controllability_factor(

@@ -12,15 +12,12 @@ from numpy.typing import NDArray
 
 from palpate.diagonal_system import DiagonalSystem
 from palpate.model import StateSpace
+from palpate.reduction.balancing import Balancing, Gramians, balance
 from palpate.reduction.block_form import diagonalise, to_block_form
+from palpate.reduction.errors import ReductionError as ReductionError
 from palpate.reduction.frequencies import band_frequencies, relative_errors
-from palpate.reduction.gramians import (
-    RealForm,
-    band_controllability_factor,
-    controllability_factor,
-    observability_factor,
-    real_form,
-)
+from palpate.reduction.gramians import band_controllability_factor, gramians, real_form
+from palpate.reduction.search import smallest_order
 
 Method = Literal["tbr", "tbr-band", "modal", "modal-static"]
 METHODS: tuple[Method, ...] = ("tbr", "tbr-band", "modal", "modal-static")
@@ -31,14 +28,8 @@ Array = NDArray[np.float64]
 # square root at worst, so this keeps them to 1e-10 of the largest.
 _GRAMIAN_TOLERANCE = 1e-20
 _BAND_FREQUENCIES = 120
-_RANK_TOLERANCE = 1e-13  # Hankel singular values below it, relative, are round-off
-
 
 Response = Callable[[DiagonalSystem, Array], NDArray[np.complex128]]
-
-
-class ReductionError(ValueError):
-    """A system can't be reduced as asked; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -107,11 +98,13 @@ def reduce(
     _check_arguments(method, order, tolerance, band_hz)
     _check_stability(system)
     singular_values: Array = np.zeros(0)
-    tail: Callable[[int], float] | None = None
+    bound: float | None = None
     if method == "tbr":
-        family, singular_values, tail = _balanced(system)
+        family, balancing = _balanced(system, gramians(system, _GRAMIAN_TOLERANCE))
+        singular_values = balancing.sigma
     elif method == "tbr-band":
-        family, singular_values = _band_balanced(system, band_hz)
+        family, balancing = _balanced(system, _band_limited(system, band_hz))
+        singular_values = balancing.sigma
     else:
         family = _modal(system, keep_statics=method == "modal-static")
     if order is not None:
@@ -125,7 +118,9 @@ def reduce(
             f"{method} at order {chosen} has a spectral abscissa of {reduced.spectral_abscissa:.3g} 1/s, "
             "expected below 0: choose another order"
         )
-    return Reduction(method, reduced, singular_values, None if tail is None else tail(chosen))
+    if method == "tbr":
+        bound = 2 * balancing.tail(chosen)
+    return Reduction(method, reduced, singular_values, bound)
 
 
 def _continuous(system: DiagonalSystem, omega: Array) -> NDArray[np.complex128]:
@@ -162,70 +157,21 @@ def _check_stability(system: DiagonalSystem) -> None:
         )
 
 
-def _balanced(system: DiagonalSystem) -> tuple[_Family, Array, Callable[[int], float]]:
-    """Balanced truncation by square roots of the Gramians (Tombs & Postlethwaite 1987)."""
+def _balanced(system: DiagonalSystem, gramians: Gramians) -> tuple[_Family, Balancing]:
     form = real_form(system)
-    control = controllability_factor(system, _GRAMIAN_TOLERANCE)
-    if system.is_symmetric:
-        # Q = S P S: the Hankel matrix L^T S L is symmetric, and eigenvalues do for singular values.
-        observe = control
-        signed = form.signature[:, None] * control.factor
-        values, vectors = np.linalg.eigh(signed.T @ control.factor)
-        descending = np.argsort(np.abs(values))[::-1]
-        values, right = values[descending], vectors[:, descending]
-        left = right * np.where(values < 0, -1.0, 1.0)
-        sigma = np.abs(values)
-        observe_factor = signed
-    else:
-        observe = observability_factor(system, _GRAMIAN_TOLERANCE)
-        observe_factor = observe.factor
-        left, sigma, right_transposed = np.linalg.svd(observe_factor.T @ control.factor)
-        left, right = left[:, : len(sigma)], right_transposed[: len(sigma)].T
-    # With P = L L^T + R and Q likewise, the Hankel singular values of the whole differ from sigma by at most this in
-    # sum (Mirsky's inequality; nuclear norms of the missing blocks).
-    missing = (
-        math.sqrt(observe.trace * control.residual)
-        + math.sqrt(control.trace * observe.residual)
-        + math.sqrt(control.residual * observe.residual)
-    )
-
-    def tail(order: int) -> float:
-        return float(2 * (np.sum(sigma[order:]) + missing))
-
-    return _projected(system, form, control.factor, observe_factor, left, sigma, right), sigma, tail
-
-
-def _band_balanced(system: DiagonalSystem, band_hz: tuple[float, float]) -> tuple[_Family, Array]:
-    """One-sided band-limited balancing (Sreeram & Ghafoor 2005)."""
-    form = real_form(system)
-    band = (2 * math.pi * band_hz[0], 2 * math.pi * band_hz[1])
-    control = band_controllability_factor(system, band, _BAND_FREQUENCIES)
-    if system.is_symmetric:
-        observe = form.signature[:, None] * controllability_factor(system, _GRAMIAN_TOLERANCE).factor
-    else:
-        observe = observability_factor(system, _GRAMIAN_TOLERANCE).factor
-    left, sigma, right = np.linalg.svd(observe.T @ control, full_matrices=False)
-    return _projected(system, form, control, observe, left, sigma, right.T), sigma
-
-
-def _projected(
-    system: DiagonalSystem,
-    form: RealForm,
-    control: Array,
-    observe: Array,
-    left: Array,
-    sigma: Array,
-    right: Array,
-) -> _Family:
-    """Square-root projections W = observe left / sqrt(sigma), T = control right / sqrt(sigma), for any order."""
-    rank = int(np.count_nonzero(sigma > _RANK_TOLERANCE * sigma[0])) if len(sigma) else 0
+    balancing = balance(form, gramians)
 
     def at(order: int) -> DiagonalSystem:
-        scale = 1 / np.sqrt(sigma[:order])
-        w, t = observe @ (left[:, :order] * scale), control @ (right[:, :order] * scale)
-        return diagonalise(w.T @ form.apply(t), w.T @ form.b, form.c @ t, system.d)
+        reduced = balancing.truncated(form, order)
+        return diagonalise(reduced.a, reduced.b, reduced.c, reduced.d)
 
-    return _Family(np.arange(1, rank + 1), at)
+    return _Family(np.arange(1, balancing.rank + 1), at), balancing
+
+
+def _band_limited(system: DiagonalSystem, band_hz: tuple[float, float]) -> Gramians:
+    band = (2 * math.pi * band_hz[0], 2 * math.pi * band_hz[1])
+    control = band_controllability_factor(system, band, _BAND_FREQUENCIES)
+    return Gramians(control, gramians(system, _GRAMIAN_TOLERANCE).observe)
 
 
 def _modal(system: DiagonalSystem, *, keep_statics: bool) -> _Family:
@@ -261,10 +207,7 @@ def _smallest(
     method: str,
     response: Response,
 ) -> tuple[DiagonalSystem, int]:
-    """The first stable system within the tolerance: up a ladder of orders, then all orders on its last rung.
-
-    The error does not fall monotonously with the order, so bisection would not do.
-    """
+    """The stable system of smallest order within the tolerance, and that order."""
     omega = band_frequencies((system,), band_hz)
     full = system.transfer(1j * omega)
     best = (math.inf, 0)
@@ -284,17 +227,10 @@ def _smallest(
                 return reduced
         return None
 
-    below = -1
-    rung = 0
-    while True:
-        if attempt(int(family.orders[rung])) is not None:
-            for i in range(below + 1, rung + 1):
-                reduced = attempt(int(family.orders[i]))
-                if reduced is not None:
-                    return reduced, int(family.orders[i])
-        if rung == len(family.orders) - 1:
-            raise ReductionError(
-                f"tolerance = {tolerance:g}: {method} reaches {best[0]:.2g} in {band_hz[0]:g}-{band_hz[1]:g} Hz at best, "
-                f"at order {best[1]}"
-            )
-        below, rung = rung, min(max(rung + 1, math.ceil(1.25 * rung)), len(family.orders) - 1)
+    found = smallest_order(family.orders, attempt)
+    if found is None:
+        raise ReductionError(
+            f"tolerance = {tolerance:g}: {method} reaches {best[0]:.2g} in {band_hz[0]:g}-{band_hz[1]:g} Hz at best, "
+            f"at order {best[1]}"
+        )
+    return found[1], found[0]

@@ -1,0 +1,149 @@
+"""A plain linear time-invariant system E dx/dt = A x + B u, y = C x + D u, dense or sparse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Matrix = Any  # (n, n) dense array or scipy sparse array: scipy's two have no common type
+
+
+@dataclass(frozen=True)
+class LinearSystem:
+    """E dx/dt = A x + B u, y = C x + D u, real.
+
+    a  (n, n), dense or scipy sparse
+    b  (n, n_inputs), c (n_outputs, n), d (n_outputs, n_inputs), dense
+    e  (n, n), regular, dense or scipy sparse; None for the identity
+
+    Raises ValueError where the shapes do not fit or a value is not finite.
+    """
+
+    a: Matrix
+    b: Array
+    c: Array
+    d: Array
+    e: Matrix | None = None
+
+    def __post_init__(self) -> None:
+        n, m, p = self.a.shape[0], self.b.shape[1], self.c.shape[0]
+        expected = {"a": (n, n), "b": (n, m), "c": (p, n), "d": (p, m), "e": (n, n)}
+        for name, shape in expected.items():
+            value: Any = getattr(self, name)
+            if value is None:
+                continue
+            if value.shape != shape:
+                raise ValueError(f"{name} has shape {value.shape}: expected {shape}")
+            entries = value.data if _is_sparse(value) else value
+            if not np.all(np.isfinite(entries)):
+                raise ValueError(f"{name} holds values that are not finite")
+
+    @property
+    def n_states(self) -> int:
+        return int(self.a.shape[0])
+
+    @property
+    def n_inputs(self) -> int:
+        return self.b.shape[1]
+
+    @property
+    def n_outputs(self) -> int:
+        return self.c.shape[0]
+
+    @property
+    def is_sparse(self) -> bool:
+        return _is_sparse(self.a)
+
+    def apply(self, x: Array) -> Array:
+        """A x for x (n, k)."""
+        return np.asarray(self.a @ x)
+
+    def mass(self, x: Array) -> Array:
+        """E x for x (n, k)."""
+        return x if self.e is None else np.asarray(self.e @ x)
+
+    def explicit(self) -> LinearSystem:
+        """The same system dense and with E = I. Raises ValueError where E is singular to working precision."""
+        if self.e is None and not self.is_sparse:
+            return self
+        a = _dense(self.a)
+        if self.e is None:
+            return LinearSystem(a, self.b, self.c, self.d)
+        e = _dense(self.e)
+        if not np.linalg.cond(e) < 1 / np.finfo(float).eps:
+            raise ValueError("e is singular to working precision: expected a regular matrix")
+        solved = np.asarray(np.linalg.solve(e, np.hstack([a, self.b])), dtype=np.float64)
+        n = self.n_states
+        return LinearSystem(solved[:, :n], solved[:, n:], self.c, self.d)
+
+    @cached_property
+    def poles(self) -> Complex:
+        """(n,): eigenvalues of E^-1 A, dense computation."""
+        return np.linalg.eigvals(self.explicit().a).astype(np.complex128)
+
+    @property
+    def spectral_abscissa(self) -> float:
+        """Largest real part of the poles; minus infinity without states."""
+        return float(np.max(self.poles.real, initial=-np.inf))
+
+    def transfer(self, s: NDArray[np.complexfloating[Any, Any]]) -> Complex:
+        """(n_points, n_outputs, n_inputs): C (s E - A)^-1 B + D at the points s (n_points,)."""
+        return self.c @ self.solutions(s) + self.d
+
+    def solutions(self, s: NDArray[np.complexfloating[Any, Any]]) -> Complex:
+        """(n_points, n, n_inputs): (s E - A)^-1 B. One factorisation for all points if dense, one a point if sparse."""
+        out = np.empty((len(s), self.n_states, self.n_inputs), dtype=np.complex128)
+        if self.n_states == 0:
+            return out
+        if self.is_sparse:
+            e = sparse.eye_array(self.n_states) if self.e is None else self.e
+            rhs = self.b.astype(np.complex128)
+            for i, point in enumerate(s):
+                out[i] = splu(sparse.csc_array(point * e - self.a)).solve(rhs)
+            return out
+        dense = self.explicit()
+        triangle, basis = scipy.linalg.schur(dense.a, output="complex")
+        rhs = basis.conj().T @ dense.b
+        identity = np.eye(self.n_states)
+        for i, point in enumerate(s):
+            out[i] = basis @ scipy.linalg.solve_triangular(point * identity - triangle, rhs)
+        return out
+
+
+def _is_sparse(matrix: Matrix) -> bool:
+    return bool(sparse.issparse(matrix))
+
+
+def _dense(matrix: Matrix) -> Array:
+    return np.asarray(matrix.toarray() if _is_sparse(matrix) else matrix, dtype=np.float64)
+
+
+def split(system: LinearSystem) -> tuple[LinearSystem, LinearSystem]:
+    """(stable, rest): the poles with Re < 0 and the others; the two transfer functions add up, D with the first.
+
+    Ordered real Schur form and a Sylvester equation; E = I in the results. system must be dense.
+    """
+    explicit = system.explicit()
+    triangle, basis, n_stable = scipy.linalg.schur(explicit.a, sort=lambda re, im: re < 0)
+    k = int(n_stable)
+    # T11 X - X T22 = -T12 makes [[I, X], [0, I]] the change of basis that decouples.
+    x = scipy.linalg.solve_sylvester(triangle[:k, :k], -triangle[k:, k:], -triangle[:k, k:])
+    b, c = basis.T @ explicit.b, explicit.c @ basis
+    stable = LinearSystem(triangle[:k, :k], b[:k] - x @ b[k:], c[:, :k], explicit.d)
+    rest = LinearSystem(triangle[k:, k:], b[k:], c[:, k:] + c[:, :k] @ x, np.zeros_like(explicit.d))
+    return stable, rest
+
+
+def parallel(first: LinearSystem, second: LinearSystem) -> LinearSystem:
+    """The sum of two dense systems with E = I."""
+    a = scipy.linalg.block_diag(first.a, second.a)
+    return LinearSystem(a, np.vstack([first.b, second.b]), np.hstack([first.c, second.c]), first.d + second.d)
