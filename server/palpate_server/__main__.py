@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     flush=True,
                 )
 
-            serve(model, limits, session, keys, stop, announce)
+            serve(model, limits, session, keys, stop, announce, options.black_box)
     except (OSError, ModelFileError, transport.TransportError, ValueError) as error:
         print(f"palpate serve: {error}", file=sys.stderr)
         return EXIT_REFUSED
@@ -86,6 +86,12 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FILE",
         help="Zenoh configuration (JSON5), used as it is: TLS, access control, routers",
+    )
+    parser.add_argument(
+        "--black-box",
+        type=Path,
+        metavar="FOLDER",
+        help="write the last two seconds there after a fault, a stale input or a storm of limits",
     )
     limits = parser.add_argument_group("limits", "what no client can exceed, for each contact")
     limits.add_argument(

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import zenoh
 
 from palpate.model import ReducedModel, StateSpace
 from palpate_server import loop, realtime, safety, telemetry, wire
+from palpate_server.black_box import BlackBox
 from palpate_server.devices import PROFILES, limits_for, stiffness_warnings
 from palpate_server.frames import Frame, read_frame
 from palpate_server.image import make_image
@@ -39,7 +41,14 @@ class Server:
     calls `publish_status` sends the status.
     """
 
-    def __init__(self, model: ReducedModel, limits: Limits, session: zenoh.Session, keys: wire.Keys) -> None:
+    def __init__(
+        self,
+        model: ReducedModel,
+        limits: Limits,
+        session: zenoh.Session,
+        keys: wire.Keys,
+        black_box: Path | None = None,
+    ) -> None:
         self.model = model
         self.limits = limits
         self.session = session
@@ -51,6 +60,9 @@ class Server:
             model.discrete, model.period_s, [limits] * len(self.names), SURFACE_PERIOD_S
         )
         self.image = make_image(self.memory)
+        self._black_box = (
+            BlackBox(black_box, keys.session, self.names, self.memory) if black_box is not None else None
+        )
         self._contact_index = {name: i for i, name in enumerate(self.names)}
         self._last_sequence = [-1] * len(self.names)
         self._state = "running"
@@ -206,6 +218,8 @@ class Server:
     def publish_status(self) -> None:
         status = telemetry.status(self._state, time.monotonic_ns(), self.memory, self.messages, self.leases)
         self._status.put(wire.pack(status))
+        if self._black_box is not None:
+            self._black_box.examine()
 
     def _publish_surfaces(self) -> None:
         surface = self.model.surface
@@ -458,10 +472,11 @@ def serve(
     session: zenoh.Session,
     keys: wire.Keys,
     stop: threading.Event,
-    on_ready: Callable[[], None] = lambda: None,
+    on_ready: Callable[[], None],
+    black_box: Path | None = None,
 ) -> None:
-    """Serve until `stop` is set."""
-    server = Server(model, limits, session, keys)
+    """Serve until `stop` is set; black box files go to the folder `black_box`, or nowhere."""
+    server = Server(model, limits, session, keys, black_box)
     server.start()
     on_ready()
     while not stop.wait(STATUS_PERIOD_S):

@@ -5,11 +5,19 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LEASE_MS = 1000  # after which a peer that does not answer counts as gone
+
+_QUIET: dict[str, Any] = {
+    "mode": "peer",
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "transport/link/tx/lease": LEASE_MS,
+}
 
 
 class TransportError(Exception):
@@ -21,34 +29,41 @@ def open_session(listen: str | None, config_file: Path | None) -> zenoh.Session:
 
     Raises TransportError when the file can't be read, or the endpoint is malformed or in use.
     """
-    try:
-        if config_file is not None:
-            if not config_file.is_file():
-                raise TransportError(f"zenoh configuration {config_file}: no such file")
-            config = zenoh.Config.from_file(config_file)
-        else:
-            config = _listening_peer(listen or DEFAULT_ENDPOINT)
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        origin = f"zenoh configuration {config_file}" if config_file else f"endpoint {listen}"
-        raise TransportError(f"{origin}: {_first_cause(error)}") from error
-
-
-def _listening_peer(endpoint: str) -> zenoh.Config:
-    config = zenoh.Config()
+    endpoint = listen or DEFAULT_ENDPOINT
     settings = {
-        "mode": "peer",
         "listen/endpoints": [endpoint],
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "transport/link/tx/lease": LEASE_MS,
         # Forces are sent unbatched: room for 16 of them while the sender's thread is held up, then drop at once.
         "transport/link/tx/queue/size/real_time": 16,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     }
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
+    return _open(settings, endpoint, config_file)
+
+
+def connect_session(endpoint: str, config_file: Path | None) -> zenoh.Session:
+    """A session that connects to an endpoint, or one with exactly the configuration in a file. Raises TransportError."""
+    settings = {
+        "listen/endpoints": [],
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": 2000,
+        "connect/exit_on_failure": True,
+    }
+    return _open(settings, endpoint, config_file)
+
+
+def _open(settings: dict[str, Any], endpoint: str, config_file: Path | None) -> zenoh.Session:
+    try:
+        if config_file is None:
+            config = zenoh.Config()
+            for key, value in (_QUIET | settings).items():
+                config.insert_json5(key, json.dumps(value))
+        elif config_file.is_file():
+            config = zenoh.Config.from_file(config_file)
+        else:
+            raise TransportError(f"zenoh configuration {config_file}: no such file")
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        origin = f"zenoh configuration {config_file}" if config_file else f"endpoint {endpoint}"
+        raise TransportError(f"{origin}: {_first_cause(error)}") from error
 
 
 def _first_cause(error: zenoh.ZError) -> str:

@@ -6,11 +6,13 @@ import csv
 import json
 import os
 import random
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -411,3 +413,53 @@ def test_a_zenoh_configuration_is_used_as_it_is(
     finally:
         process.kill()
         process.communicate()
+
+
+def test_metrics_of_a_running_server_are_served_to_prometheus(
+    serve: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve()
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    options = ("--connect", served.endpoint, "--session", "test", "--port", str(port))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "palpate_server.metrics", *options],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        assert "metrics of" in process.stdout.readline()
+
+        def scrape() -> str:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as reply:
+                return str(reply.read().decode())
+
+        wait_until(lambda: "palpate_up 1.0" in scrape())
+        text = scrape()
+        assert 'palpate_malformed_total{reason="not_msgpack"} 0.0' in text
+        assert 'palpate_success_rate{contact="tip"} 0.0' in text
+        assert float(re.findall(r"^palpate_ticks_total (\S+)", text, re.MULTILINE)[0]) > 0
+        served.stop()
+        wait_until(lambda: "palpate_up 0.0" in scrape())
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_killed_client_leaves_a_black_box_behind(
+    serve: Callable[..., Any], run_example: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+) -> None:
+    folder = tmp_path / "boxes"
+    served = serve("--black-box", str(folder))
+    with connect(served.endpoint) as observer:
+        client = run_example("headless_client.py", served.endpoint, "--duration-s", "60")
+        wait_until(lambda: observer.forces[-1]["force_scale"][0] == 1)
+        client.kill()
+        wait_until(lambda: list(folder.glob("*-stale.npz")))
+    served.stop()
+    (path,) = folder.glob("*-stale.npz")
+    with np.load(path, allow_pickle=False) as file:
+        assert np.any(file["force_n"])
+        assert not np.any(file["force_n"][-1])

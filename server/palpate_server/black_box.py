@@ -1,0 +1,109 @@
+"""The last two seconds of ticks, written to a file when something went wrong in them."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from palpate_server import loop
+from palpate_server.safety import Flags
+
+log = logging.getLogger("palpate_server")
+
+KEPT_TICKS = 2000
+STORM_TICKS = 1000  # in so many ticks,
+STORM_SHARE = 0.5  # so large a share with a limit met is a storm
+QUIET_S = 10.0  # between two files
+
+_LIMITED = int(
+    Flags.WORKSPACE_CLAMPED
+    | Flags.SPEED_LIMITED
+    | Flags.SLEW_LIMITED
+    | Flags.FORCE_CLAMPED
+    | Flags.PASSIVITY_LIMITED
+)
+
+
+class BlackBox:
+    """Looks at new ticks each time `examine` is called (some times a second) and writes a file when there is cause.
+
+    Causes: `fault` (a force that was not finite), `stale` (a contact's force had to fade to zero), `limits` (half of
+    the last second's ticks met a limit). One file in QUIET_S; the writing is done by a thread of its own.
+    """
+
+    def __init__(self, folder: Path, session: str, contacts: Sequence[str], memory: loop.Memory) -> None:
+        self.folder = folder
+        self.session = session
+        self.contacts = list(contacts)
+        self.memory = memory
+        self._seen = 0
+        self._last_file_s = -np.inf
+
+    def examine(self) -> threading.Thread | None:
+        """The thread that writes a file, when there was cause for one."""
+        head = int(loop.records_written(self.memory.shared))
+        first = max(self._seen, head - loop.RECORDS // 2, 0)
+        cause = self._cause(first, head)
+        self._seen = head
+        now = time.monotonic()
+        if cause is None or now - self._last_file_s < QUIET_S:
+            return None
+        self._last_file_s = now
+        thread = threading.Thread(target=self._write, args=(cause, head), name="black box", daemon=True)
+        thread.start()
+        return thread
+
+    def _cause(self, first: int, head: int) -> str | None:
+        if first == head:
+            return None
+        flags = self._flags(first, head)
+        if np.any(flags & int(Flags.FAULT)):
+            return "fault"
+        before = self._flags(first - 1, head - 1) if first else np.full_like(flags, int(Flags.STALE))
+        became_stale = (flags & int(Flags.STALE) > 0) & (before & int(Flags.DECAYING) > 0)
+        if np.any(became_stale):
+            return "stale"
+        recent = self._flags(max(0, head - STORM_TICKS), head)
+        if len(recent) == STORM_TICKS and np.mean(np.any(recent & _LIMITED, axis=1)) >= STORM_SHARE:
+            return "limits"
+        return None
+
+    def _flags(self, first: int, last: int) -> loop.Integers:
+        """(ticks, n_contacts)"""
+        rows = np.arange(first, last) % loop.RECORDS
+        return self.memory.record_inputs[rows, :, loop.CONTACT_FLAGS]
+
+    def _write(self, cause: str, head: int) -> None:
+        ticks = np.arange(max(0, head - KEPT_TICKS), head)
+        rows = ticks % loop.RECORDS
+        times = self.memory.record_times[rows]
+        inputs = self.memory.record_inputs[rows]
+        motion = self.memory.record_motion[rows]
+        path = self.folder / f"palpate-{self.session}-tick{head}-{cause}.npz"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            np.savez(
+                path,
+                contacts=np.array(self.contacts),
+                tick=ticks,
+                server_time_ns=times[:, loop.START_NS],
+                deadline_ns=times[:, loop.TICK_DEADLINE_NS],
+                compute_time_ns=times[:, loop.COMPUTE_NS],
+                sequence=inputs[:, :, loop.SEQUENCE],
+                client_time_ns=inputs[:, :, loop.CLIENT_TIME_NS],
+                input_age_ns=inputs[:, :, loop.AGE_NS],
+                flags=inputs[:, :, loop.CONTACT_FLAGS],
+                displacement_m=motion[:, :, 0:3],
+                force_n=motion[:, :, 3:6],
+                force_scale=motion[:, :, loop.SCALE],
+                energy_j=motion[:, :, loop.ENERGY_J],
+            )
+        except OSError as error:
+            log.warning("black box %s could not be written: %s", path, error)
+        else:
+            log.warning("%s: the last %d ticks are in %s", cause, len(ticks), path)

@@ -1,0 +1,99 @@
+"""The black box: when it writes, what is in the file, and that it does not write too often."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.model import ReducedModel
+from palpate_server import loop
+from palpate_server.black_box import BlackBox
+from palpate_server.image import make_image
+from palpate_server.safety import Limits
+
+PERIOD_NS = 1_000_000
+
+
+def run(memory: loop.Memory, ticks: int, depth_m: float, first: int = 0) -> None:
+    image = make_image(memory)
+    for i in range(first, first + ticks):
+        now = time.monotonic_ns()
+        memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS // 4
+        loop.write_command(memory.commands, 0, i, 7, now, -1, (0.0, 0.0, depth_m), (0.0, 0.0, 0.0))
+        loop.tick_on_arrival(image, now)
+
+
+def silence(memory: loop.Memory, ticks: int) -> None:
+    image = make_image(memory)
+    loop.forget_command(memory.commands, 0)
+    for _ in range(ticks):
+        now = time.monotonic_ns()
+        memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS // 4
+        loop.tick_on_arrival(image, now)
+
+
+@pytest.fixture
+def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> loop.Memory:
+    model = make_spring_mass_model()
+    return loop.make_memory(model.discrete, model.period_s, [Limits(0.01, 1e9, 1e6, 1.0, 0.0)], 1 / 30)
+
+
+def test_nothing_is_written_while_all_is_well(memory: loop.Memory, tmp_path: Path) -> None:
+    box = BlackBox(tmp_path, "s", ["tip"], memory)
+    silence(memory, 10)  # nobody has come yet: stale, but no event
+    assert box.examine() is None
+    run(memory, 1500, 1e-9)
+    assert box.examine() is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_stale_input_is_written_once_with_the_ticks_before_it(memory: loop.Memory, tmp_path: Path) -> None:
+    box = BlackBox(tmp_path / "new", "s", ["tip"], memory)
+    run(memory, 2500, 1e-9)
+    assert box.examine() is None
+    silence(memory, 100)
+    writing = box.examine()
+    assert writing is not None
+    writing.join()
+    (path,) = (tmp_path / "new").glob("palpate-s-*-stale.npz")
+    with np.load(path, allow_pickle=False) as file:
+        assert file["contacts"].tolist() == ["tip"]
+        np.testing.assert_array_equal(file["tick"], np.arange(600, 2600))
+        np.testing.assert_array_equal(file["sequence"][:1900, 0], np.arange(600, 2500))
+        assert file["force_n"].shape == (2000, 1, 3)
+    run(memory, 100, 1e-9, first=3000)
+    silence(memory, 100)
+    assert box.examine() is None  # too soon after the last one
+
+
+def test_a_fault_and_a_storm_of_limits_are_named(memory: loop.Memory, tmp_path: Path) -> None:
+    box = BlackBox(tmp_path, "s", ["tip"], memory)
+    run(memory, 1500, 1e-2)  # beyond the force limit all the time
+    writing = box.examine()
+    assert writing is not None
+    writing.join()
+    assert len(list(tmp_path.glob("*-limits.npz"))) == 1
+
+    box = BlackBox(tmp_path, "s", ["tip"], memory)
+    memory.state[0] = np.nan
+    run(memory, 5, 0.0, first=2000)
+    writing = box.examine()
+    assert writing is not None
+    writing.join()
+    assert len(list(tmp_path.glob("*-fault.npz"))) == 1
+
+
+def test_a_folder_that_cannot_be_written_is_only_a_warning(
+    memory: loop.Memory, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").write_text("")
+    box = BlackBox(tmp_path / "file", "s", ["tip"], memory)
+    run(memory, 1500, 1e-2)
+    writing = box.examine()
+    assert writing is not None
+    writing.join()
+    assert "could not be written" in caplog.text
