@@ -20,11 +20,11 @@ ENV PATH=/opt/palpate/bin:$PATH \
 USER palpate
 WORKDIR /models
 # The kernels are compiled here, as the user that will run them: the server then starts in under a second.
-RUN python -m palpate_server --compile-kernels
+RUN python -c "from palpate_server.server import warm_up; warm_up(0.001, 1)"
 EXPOSE 7447
 STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=10s --timeout=5s --start-period=10s --retries=3 \
-    CMD ["python", "-m", "palpate_server", "--check", "tcp/127.0.0.1:7447"]
+    CMD ["palpate", "health"]
 ENTRYPOINT ["palpate"]
 # Mount a folder with the model at /models. Listening beyond loopback is the container's decision, made here:
 # publish the port only where it is wanted, for example `docker run -p 127.0.0.1:7447:7447`.

@@ -138,7 +138,13 @@ def serve(context: typer.Context) -> None:
 @app.command(context_settings={**PASS_THROUGH, "help_option_names": []})
 def client(context: typer.Context) -> None:
     """Poke a running server and check every answer (`palpate client --help` for its options)."""
-    os.execv(sys.executable, [sys.executable, str(client_example("headless_client.py")), *context.args])
+    _run_example("headless_client.py", context.args)
+
+
+@app.command(context_settings={**PASS_THROUGH, "help_option_names": []})
+def health(context: typer.Context) -> None:
+    """Say whether a server is there and its loop runs (`palpate health --help` for its options)."""
+    _run_example("health.py", context.args)
 
 
 @app.command()
@@ -155,9 +161,10 @@ def demo(
     summary.print(console)
 
 
-def client_example(name: str) -> Path:
-    """Path of a client example as installed."""
-    return Path(str(files("palpate_client_examples") / name))
+def _run_example(name: str, arguments: list[str]) -> None:
+    """Become a client example, as installed."""
+    path = str(files("palpate_client_examples") / name)
+    os.execv(sys.executable, [sys.executable, path, *arguments])
 
 
 @contextmanager
