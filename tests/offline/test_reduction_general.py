@@ -79,7 +79,7 @@ def difference(first, second):
 
 
 def largest_gain(system):
-    s = 1j * np.concatenate([[0.0], np.geomspace(1e-4, 1e4, 1500), np.abs(system.poles.imag)])
+    s = 1j * np.concatenate([[0.0], np.geomspace(1e-4, 1e4, 500), np.abs(system.poles.imag)])
     return np.max(np.linalg.norm(system.transfer(s), 2, axis=(1, 2)))
 
 

@@ -5,6 +5,7 @@ from importlib import resources
 import numpy as np
 import pytest
 
+from palpate.diagonal_system import DiagonalSystem
 from palpate.discretization import collocation, conservative
 from palpate.geometry.fill import fill_surface
 from palpate.geometry.regions import PlaneRegion, contact_patch, nodes_in
@@ -12,9 +13,12 @@ from palpate.geometry.shapes import box_lattice
 from palpate.geometry.spacing import Refinement
 from palpate.geometry.surface import load_surface
 from palpate.material import PRESETS
-from palpate.reduction import discretise, fit_surface_output, reduce
+from palpate.reduction import discretise, fit_surface_output, hankel_optimal, reduce
+from palpate.reduction.balancing import balance
+from palpate.reduction.block_form import diagonalise
 from palpate.reduction.evidence import hinf_error, in_band_error
 from palpate.reduction.frequencies import band_frequencies
+from palpate.reduction.gramians import gramians, real_form
 from palpate.viscoelastic import viscoelastic_system
 
 
@@ -47,6 +51,23 @@ def test_balanced_truncation_of_the_cube_with_a_thousand_nodes_is_below_one_perc
         assert errors[order] <= reduction.error_bound / largest
     assert errors[200] < 0.01
     assert errors[200] < errors[120]
+
+
+@pytest.mark.slow
+def test_hankel_optimal_reduction_of_eight_thousand_states_reaches_the_next_singular_value():
+    _, full = cube(10, conservative)
+    reduced = hankel_optimal(full, 100)
+    plain = reduced.system
+    other = diagonalise(plain.a, plain.b, plain.c, plain.d)
+    difference = DiagonalSystem(
+        np.concatenate([full.poles, other.poles]),
+        np.concatenate([full.b, other.b]),
+        np.concatenate([full.c, -other.c], axis=1),
+        full.d - other.d,
+        np.arange(len(full.poles) + len(other.poles)),
+    )
+    hankel_norm = balance(real_form(difference), gramians(difference, 1e-20)).sigma[0]
+    assert hankel_norm == pytest.approx(reduced.hankel_singular_values[100], rel=1e-6)
 
 
 @pytest.mark.slow
