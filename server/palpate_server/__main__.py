@@ -54,7 +54,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     flush=True,
                 )
 
-            serve(model, limits, session, keys, stop, announce, options.black_box)
+            serve(
+                model,
+                limits,
+                session,
+                keys,
+                stop,
+                announce,
+                options.models or options.model.parent,
+                options.black_box,
+            )
     except (OSError, ModelFileError, transport.TransportError, ValueError) as error:
         print(f"palpate serve: {error}", file=sys.stderr)
         return EXIT_REFUSED
@@ -86,6 +95,12 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FILE",
         help="Zenoh configuration (JSON5), used as it is: TLS, access control, routers",
+    )
+    parser.add_argument(
+        "--models",
+        type=Path,
+        metavar="FOLDER",
+        help="where clients may load other models from while the server runs (default: the folder of MODEL.npz)",
     )
     parser.add_argument(
         "--black-box",

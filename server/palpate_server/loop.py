@@ -89,6 +89,18 @@ class Commands(NamedTuple):
     velocity: Floats
 
 
+class Model(NamedTuple):
+    """A discrete model and its state, as in `kernel`, and the force it gives, (n_contacts, 3), N."""
+
+    diagonal: Floats
+    cross: Floats
+    b_transposed: Floats
+    c: Floats
+    d: Floats
+    state: Floats
+    force: Floats
+
+
 class Memory(NamedTuple):
     """All that the tick reads and writes, made once. n = n_contacts; int64 and float64.
 
@@ -104,7 +116,8 @@ class Memory(NamedTuple):
                      before, and the one that the device was rendering
     displacement, force  (n, 3), m and N, the model's input and output
     scale, energy    (n,), how much of the force is given out; J that the port took in
-    diagonal, cross, b_transposed, c, d, state    the discrete model, as in `kernel`
+    model, next_model  the one that runs, and the one that is faded in; fade (2,): the share of the latter's force, and by
+                     how much it grows each tick, 0 without a next model
     record_times     (RECORDS, 4), record_inputs (RECORDS, n, 4), record_motion (RECORDS, n, 8): a ring, tick t at
                      t % RECORDS
     snapshot_every   (1,), ticks between two snapshots
@@ -136,12 +149,9 @@ class Memory(NamedTuple):
     force: Floats
     scale: Floats
     energy: Floats
-    diagonal: Floats
-    cross: Floats
-    b_transposed: Floats
-    c: Floats
-    d: Floats
-    state: Floats
+    model: Model
+    next_model: Model
+    fade: Floats
     record_times: Integers
     record_inputs: Integers
     record_motion: Floats
@@ -152,12 +162,36 @@ class Memory(NamedTuple):
     snapshot_displacement: Floats
 
 
+def make_model(system: StateSpace, displacement: Floats | None = None) -> Model:
+    """The model at rest, or where it settles when `displacement` (n_inputs,), m, stays: xi = (1 - A)^-1 B u."""
+    state: Floats = np.zeros(system.order)
+    if displacement is not None:
+        drive = (system.b @ displacement).reshape(-1, 2, 1)
+        blocks = np.empty((system.order // 2, 2, 2))
+        blocks[:, 0, 0], blocks[:, 1, 1] = 1 - system.diagonal[0::2], 1 - system.diagonal[1::2]
+        blocks[:, 0, 1], blocks[:, 1, 0] = -system.cross[0::2], -system.cross[1::2]
+        state = np.linalg.solve(blocks, drive).ravel()
+    return Model(
+        diagonal=system.diagonal.copy(),
+        cross=system.cross.copy(),
+        b_transposed=np.ascontiguousarray(system.b.T),
+        c=system.c.copy(),
+        d=system.d.copy(),
+        state=state,
+        force=np.zeros((len(system.c) // 3, 3)),
+    )
+
+
+def _nothing(n_contacts: int) -> StateSpace:
+    n = 3 * n_contacts
+    return StateSpace(np.zeros(0), np.zeros(0), np.zeros((0, n)), np.zeros((n, 0)), np.zeros((n, n)))
+
+
 def make_memory(
     system: StateSpace, period_s: float, limits: Sequence[Limits], snapshot_period_s: float
 ) -> Memory:
     """A model at rest, with no command yet, whose first deadline is a period from now."""
     n = len(limits)
-    order = system.order
     period_ns = round(period_s * 1e9)
     no_command = np.zeros((n, 4), np.int64)
     no_command[:, SEQUENCE] = no_command[:, RENDERED_TICK] = -1
@@ -189,26 +223,22 @@ def make_memory(
         force=np.zeros((n, 3)),
         scale=np.zeros(n),
         energy=np.zeros(n),
-        diagonal=system.diagonal.copy(),
-        cross=system.cross.copy(),
-        b_transposed=np.ascontiguousarray(system.b.T),
-        c=system.c.copy(),
-        d=system.d.copy(),
-        state=np.zeros(order),
+        model=make_model(system),
+        next_model=make_model(_nothing(n)),
+        fade=np.zeros(2),
         record_times=np.zeros((RECORDS, 4), np.int64),
         record_inputs=np.zeros((RECORDS, n, 4), np.int64),
         record_motion=np.zeros((RECORDS, n, 8)),
         snapshot_every=np.array([max(1, round(snapshot_period_s / period_s))]),
         snapshot_version=np.zeros(1, np.int64),
         snapshot_tick=np.zeros(1, np.int64),
-        snapshot_state=np.zeros(order),
+        snapshot_state=np.zeros(system.order),
         snapshot_displacement=np.zeros((n, 3)),
     )
 
 
-_NOTHING = StateSpace(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((3, 0)), np.zeros((3, 3)))
 _typeof: Callable[[object], Any] = typeof
-_memory = make_view(_typeof(make_memory(_NOTHING, 1e-3, [Limits(1.0, 1.0, 1.0, 1.0, 1.0)], 1.0)))
+_memory = make_view(_typeof(make_memory(_nothing(1), 1e-3, [Limits(1.0, 1.0, 1.0, 1.0, 1.0)], 1.0)))
 
 
 @compiled
@@ -273,10 +303,23 @@ def set_frame(image: Image, contact: int, rotation: Floats, scale: float, origin
 @compiled
 def reset(image: Image) -> None:
     """Put the model to rest, between two ticks; every force starts from zero again."""
+    _take_lock(_memory(image))
+    m = _memory(image)
+    m.model.state[:] = 0.0
+    m.next_model.state[:] = 0.0
+    m.scale[:] = 0.0
+    store_release(m.shared, LOCK, 0)
+
+
+@compiled
+def exchange(image: Image, replacement: Image) -> None:
+    """Let the loop go on with another memory, between two ticks.
+
+    `replacement` is the image of the same memory with other `model`, `next_model`, `fade`, or snapshot arrays.
+    """
     m = _memory(image)
     _take_lock(m)
-    m.state[:] = 0.0
-    m.scale[:] = 0.0
+    image[:] = replacement
     store_release(m.shared, LOCK, 0)
 
 
@@ -306,7 +349,7 @@ def tick_on_arrival(image: Image, arrival_ns: int) -> int:
     ticks = 0
     if arrival_ns >= deadline - period // 2:
         before = m.counters[TICKS]
-        _run_due_ticks(m, arrival_ns)
+        _run_due_ticks(_memory(image), arrival_ns)
         ticks = m.counters[TICKS] - before
         m.counters[TICKS_ON_ARRIVAL] += 1
     store_release(m.shared, LOCK, 0)
@@ -329,7 +372,7 @@ def run_at_deadlines(image: Image, event_fd: int) -> None:
             continue
         if compare_and_swap(m.shared, LOCK, 0, 1):
             if m.shared[DEADLINE_NS] <= now:
-                _run_due_ticks(m, now)
+                _run_due_ticks(_memory(image), now)  # read under the lock: `exchange` may have changed it
             store_release(m.shared, LOCK, 0)
             _eventfd_write(event_fd, 1)
         else:
@@ -438,10 +481,27 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
         inputs[CONTACT_FLAGS] = flags
 
     displacement = m.displacement.reshape(3 * n_contacts)
-    kernel.output(m.c, m.d, m.state, displacement, m.force.reshape(3 * n_contacts))
+    model = m.model
+    kernel.output(model.c, model.d, model.state, displacement, model.force.reshape(3 * n_contacts))
     if tick % m.snapshot_every[0] == 0:
         _write_snapshot(m, tick)
-    kernel.update(m.diagonal, m.cross, m.b_transposed, m.state, displacement)
+    kernel.update(model.diagonal, model.cross, model.b_transposed, model.state, displacement)
+    share = 0.0
+    if m.fade[1] > 0.0:
+        following = m.next_model
+        kernel.output(
+            following.c, following.d, following.state, displacement, following.force.reshape(3 * n_contacts)
+        )
+        kernel.update(
+            following.diagonal, following.cross, following.b_transposed, following.state, displacement
+        )
+        share = min(1.0, m.fade[0] + m.fade[1])
+        m.fade[0] = share
+    for i in range(n_contacts):
+        for j in range(3):
+            m.force[i, j] = model.force[i, j]
+            if share > 0.0:
+                m.force[i, j] += share * (m.next_model.force[i, j] - model.force[i, j])
 
     finite = True
     for i in range(n_contacts):
@@ -449,7 +509,8 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
             finite &= math.isfinite(m.force[i, j])
     if not finite:
         m.counters[FAULTS] += 1
-        m.state[:] = 0.0
+        model.state[:] = 0.0
+        m.next_model.state[:] = 0.0
         m.force[:] = 0.0
         m.scale[:] = 0.0
 
@@ -525,7 +586,7 @@ def _read_command(m: Memory, contact: int) -> bool:
 def _write_snapshot(m: Memory, tick: int) -> None:
     begin_write(m.snapshot_version, 0)
     m.snapshot_tick[0] = tick
-    m.snapshot_state[:] = m.state
+    m.snapshot_state[:] = m.model.state
     m.snapshot_displacement[:] = m.displacement
     end_write(m.snapshot_version, 0)
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from palpate.model import ReducedModel, StateSpace
+from palpate.model import ModelFileError, ReducedModel, StateSpace, load_model
 from palpate_server import loop, realtime, safety, telemetry, wire
 from palpate_server.black_box import BlackBox
 from palpate_server.devices import PROFILES, limits_for, stiffness_warnings
@@ -29,6 +29,7 @@ log = logging.getLogger("palpate_server")
 
 STATUS_PERIOD_S = 0.1
 SURFACE_PERIOD_S = 1 / 30
+FADE_OVER_S = 0.5  # from one model to another
 MAX_UNSENT = 100  # ticks whose forces are still worth sending; what is older is dropped and counted
 _ALIVE_TIMEOUT_S = 1.0
 
@@ -47,6 +48,7 @@ class Server:
         limits: Limits,
         session: zenoh.Session,
         keys: wire.Keys,
+        models: Path,
         black_box: Path | None = None,
     ) -> None:
         self.model = model
@@ -60,6 +62,11 @@ class Server:
             model.discrete, model.period_s, [limits] * len(self.names), SURFACE_PERIOD_S
         )
         self.image = make_image(self.memory)
+        self._models = models
+        self._model_in_use = (
+            threading.Lock()
+        )  # while the surface is computed from it, and while it is exchanged
+        self._loading = threading.Lock()
         self._black_box = (
             BlackBox(black_box, keys.session, self.names, self.memory) if black_box is not None else None
         )
@@ -222,13 +229,16 @@ class Server:
             self._black_box.examine()
 
     def _publish_surfaces(self) -> None:
-        surface = self.model.surface
-        state = np.zeros(self.model.order)
         tips = np.zeros((len(self.names), 3))
         last_tick = -1
         while not self._stopping.wait(SURFACE_PERIOD_S):
-            tick = loop.read_snapshot(self.image, state, tips)
-            if tick <= last_tick or not self._surface.matching_status:
+            if not self._surface.matching_status:
+                continue
+            with self._model_in_use:
+                surface = self.model.surface
+                state = np.zeros(self.model.order)
+                tick = loop.read_snapshot(self.image, state, tips)
+            if tick <= last_tick:
                 continue
             last_tick = tick
             displacement = surface.output @ state.astype(np.float32)
@@ -260,6 +270,12 @@ class Server:
             query.reply(self.keys.geometry, payload, encoding=wire.ENCODING)
 
     def _answer_control(self, query: zenoh.Query) -> None:
+        if wire.last_chunk(str(query.key_expr)) == "load":  # takes its time, and changes no lease
+            threading.Thread(target=self._answer_action, args=(query,), name="load", daemon=True).start()
+        else:
+            self._answer_action(query)
+
+    def _answer_action(self, query: zenoh.Query) -> None:
         with query:
             try:
                 reply = self._carry_out(wire.last_chunk(str(query.key_expr)), _request(query))
@@ -287,6 +303,8 @@ class Server:
             return self._set_limits(client, request)
         if action == "reset":
             return self._reset(client)
+        if action == "load":
+            return self._load(client, request)
         known = ", ".join(wire.ACTIONS)
         raise Refused("unknown_action", f"no control action is called {action!r}: there are {known}")
 
@@ -379,13 +397,67 @@ class Server:
         return {"contacts": list(held), "limits": limits._asdict()}
 
     def _reset(self, client: str) -> dict[str, Any]:
+        self._check_alone(client)
+        loop.reset(self.image)
+        return {}
+
+    def _check_alone(self, client: str) -> None:
         for name, holder in self.leases.holders.items():
             if holder not in (None, client):
                 raise Refused("held", f"contact {name!r} is held by client {holder!r}, who would feel it")
         if not self.leases.held_by(client):
             raise Refused("not_holder", f"client {client!r} holds no contact")
-        loop.reset(self.image)
-        return {}
+
+    def _load(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Check another model file, build it beside the running one, fade over to it, and let the old one go."""
+        self._check_alone(client)
+        if not self._loading.acquire(blocking=False):
+            raise Refused("busy", "another model is being loaded")
+        try:
+            model = self._read_model(request.get("model"))
+            displacement = self.memory.displacement.ravel().copy()
+            following = loop.make_model(model.discrete, displacement)
+            step = model.period_s / FADE_OVER_S
+            fading = self.memory._replace(next_model=following, fade=np.array([0.0, step]))
+            loop.exchange(self.image, make_image(fading))
+            while fading.fade[0] < 1.0:
+                if self._stopping.wait(model.period_s):
+                    raise Refused("stopping", "the server is stopping")
+            with self._model_in_use:
+                self.memory = self.memory._replace(
+                    model=following,
+                    snapshot_version=np.zeros(1, np.int64),
+                    snapshot_tick=np.full(1, -1),
+                    snapshot_state=np.zeros(model.order),
+                )
+                loop.exchange(self.image, make_image(self.memory))
+                self.model = model
+            log.info("now serving %s (order %d)", model.name, model.order)
+            return {"model": model.name, "order": model.order}
+        finally:
+            self._loading.release()
+
+    def _read_model(self, name: object) -> ReducedModel:
+        if not isinstance(name, str) or Path(name).name != name or name in ("", ".", ".."):
+            raise Refused("bad_model", f"model is {name!r}: expected a file's name, without a folder")
+        path = self._models / name
+        if path.is_symlink() and path.resolve().parent != self._models.resolve():
+            raise Refused("bad_model", f"{name}: leads out of the folder of models")
+        try:
+            model = load_model(path)
+        except (OSError, ModelFileError) as error:
+            raise Refused("bad_model", str(error).replace(f"{self._models}/", "")) from error
+        names = [contact.name for contact in model.contacts]
+        if names != self.names:
+            raise Refused(
+                "bad_model", f"{name}: its contacts are {names}, the running model's are {self.names}"
+            )
+        if model.period_s != self.model.period_s:
+            raise Refused(
+                "bad_model",
+                f"{name}: its period is {model.period_s} s, the running model's {self.model.period_s} s",
+            )
+        return model
 
     def _release(self, client: str) -> tuple[str, ...]:
         released = self.leases.release(client)
@@ -441,6 +513,7 @@ def warm_up(period_s: float, n_contacts: int) -> None:
     loop.is_silent(image, 0)
     loop.set_frame(image, 0, np.eye(3), 1.0, np.zeros(3))
     loop.reset(image)
+    loop.exchange(image, make_image(memory))
     loop.read_snapshot(image, np.zeros(2), np.zeros((n_contacts, 3)))
     loop.stop(memory.shared)
     wake = os.eventfd(0)
@@ -473,10 +546,11 @@ def serve(
     keys: wire.Keys,
     stop: threading.Event,
     on_ready: Callable[[], None],
+    models: Path,
     black_box: Path | None = None,
 ) -> None:
-    """Serve until `stop` is set; black box files go to the folder `black_box`, or nowhere."""
-    server = Server(model, limits, session, keys, black_box)
+    """Serve until `stop` is set. Clients may load from the folder `models`; black box files go to `black_box`, or nowhere."""
+    server = Server(model, limits, session, keys, models, black_box)
     server.start()
     on_ready()
     while not stop.wait(STATUS_PERIOD_S):

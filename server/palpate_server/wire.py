@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SCHEMA_VERSION = 1
-ACTIONS = ("acquire", "release", "limits", "reset")  # of control queries
+ACTIONS = ("acquire", "release", "limits", "reset", "load")  # of control queries
 ENCODING = "application/msgpack;palpate.v1"
 MAX_COMMAND_BYTES = 4096
 MAX_REQUEST_BYTES = 16384

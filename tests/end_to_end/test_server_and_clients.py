@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
+import math
 import os
 import random
 import re
@@ -11,9 +13,11 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +25,9 @@ import msgpack
 import numpy as np
 import pytest
 
+from palpate.model import save_model
 from palpate_server.safety import Flags
+from palpate_server.sample_model import spring_mass_model
 
 LIMITS_MET = int(
     Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED | Flags.SLEW_LIMITED | Flags.FORCE_CLAMPED | Flags.FAULT
@@ -299,6 +305,63 @@ def test_only_who_is_alone_may_reset_the_model(
         assert second.acquire("tip1")[0]
         granted, refusal = first.query("control/reset", {"client": first.name})
         assert (granted, refusal["reason"]) == (False, "held")
+
+
+def test_a_model_is_exchanged_while_a_client_presses_and_a_bad_file_leaves_the_old_one(
+    serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serve()
+    save_model(replace(spring_mass_model(1, 35), name="other"), tmp_path / "other.npz")
+    save_model(spring_mass_model(2, 5), tmp_path / "two.npz")
+    (tmp_path / "bad.npz").write_bytes((tmp_path / "other.npz").read_bytes()[:2000])
+    outside = tmp_path.parent / "outside.npz"
+    save_model(spring_mass_model(1, 5), outside)
+    (tmp_path / "link.npz").symlink_to(outside)
+    with connect(served.endpoint) as client:
+        assert client.acquire("tip")[0]
+        stop = threading.Event()
+
+        def press() -> None:
+            while not stop.wait(0.001):
+                client.command({"tip": [0.0, 0.0, -0.004]})
+
+        thread = threading.Thread(target=press)
+        thread.start()
+        try:
+            wait_until(lambda: client.forces[-1]["force_scale"][0] == 1)
+            before = client.next_status()
+            for name in (
+                "bad.npz",
+                "two.npz",
+                "missing.npz",
+                "link.npz",
+                "../outside.npz",
+                str(outside),
+                "",
+                3,
+            ):
+                granted, refusal = client.query("control/load", {"client": client.name, "model": name})
+                assert (granted, refusal["reason"]) == (False, "bad_model")
+            assert client.query("describe")[1]["model"]["name"] == "masses on springs"
+            first = len(client.forces)
+            request = {"client": client.name, "model": "other.npz"}
+            assert client.query("control/load", request) == (True, {"model": "other", "order": 70})
+            last = len(client.forces)
+            after = client.next_status()
+        finally:
+            stop.set()
+            thread.join()
+        assert client.query("describe")[1]["model"]["name"] == "other"
+        messages = client.forces[first - 1 : last]
+        assert len(messages) > 100
+        assert all(math.isfinite(f) for message in messages for f in message["force_n"][0])
+        largest = max(
+            math.dist(a["force_n"][0], b["force_n"][0]) / (b["tick"] - a["tick"])
+            for a, b in itertools.pairwise(messages)
+        )
+        assert largest <= 2.0 + 1e-9  # the default 2000 N/s
+        assert after["faults"] == 0
+        assert after["skipped_ticks"] == before["skipped_ticks"]
 
 
 def test_describe_and_geometry_say_what_the_model_is(

@@ -150,7 +150,7 @@ def test_a_model_that_gives_nan_is_put_to_rest_and_counted(memory: loop.Memory) 
     for i in range(10):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
-    memory.state[0] = np.nan
+    memory.model.state[0] = np.nan
     flags, _, force, scale = tick(memory)
     assert flags & Flags.FAULT
     assert scale == 0
@@ -222,11 +222,49 @@ def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(memory: l
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
     loop.reset(make_image(memory))
-    np.testing.assert_array_equal(memory.state, 0)
+    np.testing.assert_array_equal(memory.model.state, 0)
     command(memory, 250, (0.0, 0.0, 1e-3))
     flags, *_, scale = tick(memory)
     assert flags & Flags.SOFT_START
     assert scale < 0.01
+
+
+def test_another_model_is_faded_in_where_it_settles(
+    memory: loop.Memory, make_spring_mass_model: Callable[..., ReducedModel]
+) -> None:
+    position = (1e-3, -2e-3, 3e-3)
+    running = make_spring_mass_model().discrete
+    for i in range(300):
+        if i == 250:  # the soft start is over: the running model has settled too
+            memory.model.state[:] = loop.make_model(running, np.array(position)).state
+        command(memory, i, position)
+        *_, before, _ = tick(memory)
+    other = make_spring_mass_model(1, 7).discrete
+    following = loop.make_model(other, np.array(position))
+    settled = following.state.copy()
+    np.testing.assert_allclose(other.dense_a() @ settled + other.b @ np.array(position), settled, atol=1e-15)
+
+    image = make_image(memory)
+    fading = memory._replace(next_model=following, fade=np.array([0.0, 0.01]))
+    loop.exchange(image, make_image(fading))
+    forces = [before]
+    for i in range(300, 400):
+        command(memory, i, position)
+        now = time.monotonic_ns()
+        memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS // 4
+        assert loop.tick_on_arrival(image, now) == 1
+        forces.append(memory.device_force[0].copy())
+    final = other.c @ settled + other.d @ np.array(position)
+    np.testing.assert_allclose(forces[-1], final, rtol=1e-9)
+    expected = before + np.linspace(0, 1, 101)[:, None] * (final - before)
+    np.testing.assert_allclose(forces, expected, rtol=0, atol=1e-6 * np.abs(final).max())
+
+    done = memory._replace(model=following, snapshot_state=np.zeros(other.order))
+    loop.exchange(image, make_image(done))
+    command(memory, 400, position)
+    memory.shared[loop.DEADLINE_NS] = time.monotonic_ns() + PERIOD_NS // 4
+    loop.tick_on_arrival(image, time.monotonic_ns())
+    np.testing.assert_allclose(memory.device_force[0], final, rtol=1e-9)
 
 
 def test_an_early_command_waits_for_the_tick_and_a_second_one_replaces_it(memory: loop.Memory) -> None:
