@@ -5,7 +5,9 @@ import pytest
 
 from palpate.discretization import conservative
 from palpate.discretization.consistency import vector_areas
-from palpate.geometry.shapes import ball, box_lattice
+from palpate.geometry.fill import fill_surface
+from palpate.geometry.shapes import ball, box_lattice, box_surface
+from palpate.geometry.spacing import Refinement
 from palpate.material import Material
 from palpate.meshfree import SupportError
 
@@ -57,6 +59,11 @@ CLOUDS = {
     "lattice": lambda: _cube(6)[0],
     "jittered": lambda: _cube(6, 0.25)[0],
     "ball": lambda: ball(1.0, 0.28),
+    "graded": lambda: fill_surface(
+        box_surface((-1, -1, -1), (1, 1, 1)),
+        0.5,
+        (Refinement((0.2, 0.1, 1.0), 0.2, 0.1, growth=0.4, rings=True),),
+    ),
 }
 
 

@@ -17,11 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh
 from scipy.sparse import csr_array, eye_array, hstack
 
-from palpate.discretization.consistency import consistent_gradient
+from palpate.discretization.consistency import consistent_gradient, vector_areas
 from palpate.discretization.nodal import NodalValues, nodal_shape_functions
 from palpate.discretization.supports import Supports, supports
 from palpate.geometry.cloud import NodeCloud
 from palpate.material import Material
+from palpate.meshfree import ShapeFunctions
 from palpate.system import ElasticModes
 
 SUPPORT_RADIUS_FACTOR = 2.2
@@ -73,9 +74,16 @@ def elastic_modes(
 
 def gradient(cloud: NodeCloud, support_radius_factor: float = SUPPORT_RADIUS_FACTOR) -> list[Array]:
     """[d/dx, d/dy, d/dz], each (n_nodes, n_nodes), 1/m: the gradient at the nodes from the nodal values."""
-    h = nodal_shape_functions(cloud, support_radius_factor, derivatives=1)
+    h, parameter_gradient = sparse_gradient(cloud, support_radius_factor)
     values = NodalValues(h.value)
-    return [values.operator(g) for g in consistent_gradient(cloud, h, support_radius_factor * cloud.spacing)]
+    return [values.operator(g) for g in parameter_gradient]
+
+
+def sparse_gradient(cloud: NodeCloud, support_radius_factor: float) -> tuple[ShapeFunctions, list[csr_array]]:
+    """The shape functions at the nodes, and the gradient from their parameters, as sparse matrices."""
+    h = nodal_shape_functions(cloud, support_radius_factor, derivatives=1)
+    radii = support_radius_factor * cloud.spacing
+    return h, consistent_gradient(cloud.points, cloud.volumes, cloud.spacing, vector_areas(cloud), h, radii)
 
 
 def stiffness(gradient: Sequence[Array], volumes: Array, material: Material) -> Array:

@@ -9,9 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
-from palpate.discretization.conservative import SUPPORT_RADIUS_FACTOR
-from palpate.discretization.consistency import consistent_gradient
-from palpate.discretization.nodal import nodal_shape_functions
+from palpate.discretization.conservative import SUPPORT_RADIUS_FACTOR, sparse_gradient
 from palpate.discretization.supports import supports
 from palpate.geometry.cloud import NodeCloud
 from palpate.material import Material
@@ -44,8 +42,7 @@ def static_stiffness(
     does not converge because the body is not held.
     """
     held = supports(cloud.n_nodes, fixed, contacts)
-    h = nodal_shape_functions(cloud, support_radius_factor, derivatives=1)
-    gradient = consistent_gradient(cloud, h, support_radius_factor * cloud.spacing)
+    h, gradient = sparse_gradient(cloud, support_radius_factor)
     values, transposed = splu(h.value.tocsc()), splu(h.value.T.tocsc())
     lam, mu = material.lame_lambda_pa, material.shear_modulus_pa
 
