@@ -35,7 +35,8 @@ def viscoelastic_system(modes: ElasticModes, prony: PronySeries) -> DiagonalSyst
     must come with their conjugates, of which one is kept. Where the body is symmetric (K_tt = K_tt^T, c = b^T), so is
     the realisation: C = B^T.
 
-    Raises ValueError where a squared frequency is zero (the body is not held) or not finite, or lacks its conjugate.
+    Raises ValueError where a squared frequency is zero (the body is not held) or not finite, or lacks its conjugate,
+    or where a mode is so exactly critically damped that two of its poles coincide.
     """
     mu, b, c = _half_of_conjugates(modes)
     symmetric = (
@@ -52,7 +53,13 @@ def viscoelastic_system(modes: ElasticModes, prony: PronySeries) -> DiagonalSyst
 
     relaxation, stress = _prony_polynomials(prony)
     poles = _roots(mu, relaxation, stress)
-    roots_of_residues = np.sqrt(_residues(poles, mu, relaxation, stress))
+    residues = _residues(poles, mu, relaxation, stress)
+    if not np.all(np.isfinite(residues)):
+        worst = int(np.argmax(~np.all(np.isfinite(residues), axis=1)))
+        raise ValueError(
+            f"two poles of the mode with squared frequency {mu[worst]:.17g} coincide: change a time constant by 1e-6"
+        )
+    roots_of_residues = np.sqrt(residues)
     n_modes, per_mode = poles.shape
     poles_b = (roots_of_residues[:, :, None] * b[:, None, :]).reshape(n_modes * per_mode, -1)
     poles_c = (roots_of_residues[:, :, None] * c.T[:, None, :]).reshape(n_modes * per_mode, -1)

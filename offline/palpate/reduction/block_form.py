@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from palpate.diagonal_system import DiagonalSystem
 from palpate.model import StateSpace
+from palpate.reduction.errors import ReductionError
 
 _LARGEST_CONDITION = 1e10  # beyond it the diagonal form keeps fewer than six digits
 
@@ -18,13 +19,13 @@ def diagonalise(
 
     Rows of b and columns of c have equal 2-norm where neither is zero. Poles ascend in modulus, each its own group.
 
-    Raises ValueError where the eigenvectors' condition number is beyond 1e10: A is not diagonalisable in doubles.
+    Raises ReductionError where the eigenvectors' condition number is beyond 1e10: A is not diagonalisable in doubles.
     """
     poles, vectors = np.linalg.eig(a)
     vectors = vectors.astype(np.complex128)
     condition = np.linalg.cond(vectors) if len(poles) else 1.0
     if not condition <= _LARGEST_CONDITION:
-        raise ValueError(
+        raise ReductionError(
             f"the eigenvectors of the state matrix have condition number {condition:.1e}, expected at most "
             f"{_LARGEST_CONDITION:.0e}: its poles nearly coincide, choose another order"
         )

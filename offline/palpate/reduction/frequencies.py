@@ -13,12 +13,16 @@ Array = NDArray[np.float64]
 
 
 def band_frequencies(systems: tuple[DiagonalSystem, ...], band_hz: tuple[float, float]) -> Array:
+    """`frequencies_near` the poles of all the systems."""
+    return frequencies_near(np.concatenate([s.poles for s in systems]), band_hz)
+
+
+def frequencies_near(poles: NDArray[np.complex128], band_hz: tuple[float, float]) -> Array:
     """(n,), rad/s, ascending: both ends of the band, 400 points even in log frequency, and the resonances inside."""
     low, high = 2 * np.pi * band_hz[0], 2 * np.pi * band_hz[1]
-    slowest = min(float(np.min(np.abs(s.poles), initial=high)) for s in systems)
+    slowest = float(np.min(np.abs(poles), initial=high))
     start = max(low, min(slowest / 100, high / 1000))
-    resonances = np.concatenate([s.poles.imag[s.is_pair] for s in systems])
-    omega = np.concatenate([[low, high], np.geomspace(start, high, 400), resonances])
+    omega = np.concatenate([[low, high], np.geomspace(start, high, 400), poles.imag[poles.imag > 0]])
     return np.unique(omega[(omega >= low) & (omega <= high)])
 
 

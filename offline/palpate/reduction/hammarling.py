@@ -7,26 +7,30 @@ import scipy.linalg
 from numba import njit
 from numpy.typing import NDArray
 
+from palpate.reduction.linear_system import LinearSystem
+
 Array = NDArray[np.float64]
 
 
-def gramian_factors(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
+def gramian_factors(system: LinearSystem) -> tuple[Array, Array]:
     """(control, observe), real, control control^T = P and observe observe^T = Q of a stable system, each (n, rank).
 
-    A P + P A^T + B B^T = 0 and A^T Q + Q A + C^T C = 0, from one complex Schur form of A. The factors come from A
+    A P + P A^T + B B^T = 0 and A^T Q + Q A + C^T C = 0, E = I, from the Schur form of A. The factors come from A
     itself, not from rounded Gramians, so small Hankel singular values keep their digits. Columns below round-off of
     the largest are left out.
 
-    Raises ValueError unless every eigenvalue of A has Re < 0.
+    Raises ValueError unless every pole has Re < 0.
     """
-    triangle, basis = scipy.linalg.schur(a, output="complex")
-    abscissa = float(np.max(np.diag(triangle).real, initial=-np.inf))
-    if not abscissa < 0:
-        raise ValueError(f"the spectral abscissa is {abscissa:.3g} 1/s: Gramians need it below 0")
-    control = _triangular_factor(np.asfortranarray(triangle), basis.conj().T @ b)
-    # The transpose of an upper triangular matrix is upper triangular in reversed order.
+    if not system.spectral_abscissa < 0:
+        raise ValueError(
+            f"the spectral abscissa is {system.spectral_abscissa:.3g} 1/s: Gramians need it below 0"
+        )
+    triangle, basis = system.schur_form
+    b, c = basis.conj().T @ system.explicit.b, basis.conj().T @ system.explicit.c.T
+    control = _eliminate(np.asfortranarray(triangle), np.ascontiguousarray(b))
+    # The adjoint of an upper triangular matrix is upper triangular in reversed order.
     reversed_adjoint = np.asfortranarray(triangle.conj().T[::-1, ::-1])
-    observe = _triangular_factor(reversed_adjoint, (basis.conj().T @ c.conj().T)[::-1])[::-1]
+    observe = _eliminate(reversed_adjoint, np.ascontiguousarray(c[::-1]))[::-1]
     return _real(basis @ control), _real(basis @ observe)
 
 
@@ -39,10 +43,6 @@ def _real(factor: NDArray[np.complex128]) -> Array:
     out = np.empty((factor.shape[0], rank))
     out[pivots] = r[:rank].T
     return out
-
-
-def _triangular_factor(triangle: NDArray[np.complex128], b: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    return _eliminate(triangle, np.ascontiguousarray(b, dtype=np.complex128))
 
 
 @njit(cache=True)

@@ -67,8 +67,7 @@ def _embedded(balanced: LinearSystem, sigmas: Array, r: int, equal: int) -> Line
     b = np.hstack([balanced.b, np.zeros((balanced.n_states, square - n_inputs))])
     c = np.vstack([balanced.c, np.zeros((square - n_outputs, balanced.n_states))])
     a1, b1, c1, sigma_1 = balanced.a[np.ix_(kept, kept)], b[kept], c[:, kept], sigmas[kept]
-    left, _, right = np.linalg.svd(-c[:, middle] @ b[middle])
-    u = left @ right  # the orthogonal solution of C_2^T U = -B_2 (Procrustes)
+    u = _orthogonal_solution(c[:, middle], b[middle])
 
     # Gamma = root sign root: the change of basis by root keeps the embedding well scaled.
     gamma = sigma_1**2 - sigma**2
@@ -88,3 +87,18 @@ def _embedded(balanced: LinearSystem, sigmas: Array, r: int, equal: int) -> Line
             f"embedding, expected {r}; choose a smaller order"
         )
     return stable
+
+
+def _orthogonal_solution(c2: Array, b2: Array) -> Array:
+    """U (m, m) orthogonal with C_2^T U = -B_2, for C_2^T C_2 = B_2 B_2^T, (k, k).
+
+    Fixed by that on k directions; on the others, where any would do, the nearest to the identity, so that the result
+    does not depend on the states' basis.
+    """
+    m, k = c2.shape
+    left, _, right = np.linalg.svd(-c2 @ b2)
+    fixed = min(k, m)
+    u = left[:, :fixed] @ right[:fixed]
+    others = (np.eye(m) - left[:, :fixed] @ left[:, :fixed].T) @ (np.eye(m) - right[:fixed].T @ right[:fixed])
+    left, _, right = np.linalg.svd(others)
+    return u + left[:, : m - fixed] @ right[: m - fixed]

@@ -71,6 +71,7 @@ class LinearSystem:
         """E x for x (n, k)."""
         return x if self.e is None else np.asarray(self.e @ x)
 
+    @cached_property
     def explicit(self) -> LinearSystem:
         """The same system dense and with E = I. Raises ValueError where E is singular to working precision."""
         if self.e is None and not self.is_sparse:
@@ -86,9 +87,15 @@ class LinearSystem:
         return LinearSystem(solved[:, :n], solved[:, n:], self.c, self.d)
 
     @cached_property
+    def schur_form(self) -> tuple[Complex, Complex]:
+        """T upper triangular and U unitary, each (n, n), complex, with E^-1 A = U T U^H; dense computation."""
+        triangle, basis = scipy.linalg.rsf2csf(*scipy.linalg.schur(self.explicit.a))
+        return triangle.astype(np.complex128), basis.astype(np.complex128)
+
+    @property
     def poles(self) -> Complex:
         """(n,): eigenvalues of E^-1 A, dense computation."""
-        return np.linalg.eigvals(self.explicit().a).astype(np.complex128)
+        return np.diag(self.schur_form[0])
 
     @property
     def spectral_abscissa(self) -> float:
@@ -110,9 +117,8 @@ class LinearSystem:
             for i, point in enumerate(s):
                 out[i] = splu(sparse.csc_array(point * e - self.a)).solve(rhs)
             return out
-        dense = self.explicit()
-        triangle, basis = scipy.linalg.schur(dense.a, output="complex")
-        rhs = basis.conj().T @ dense.b
+        triangle, basis = self.schur_form
+        rhs = basis.conj().T @ self.explicit.b
         identity = np.eye(self.n_states)
         for i, point in enumerate(s):
             out[i] = basis @ scipy.linalg.solve_triangular(point * identity - triangle, rhs)
@@ -132,7 +138,7 @@ def split(system: LinearSystem) -> tuple[LinearSystem, LinearSystem]:
 
     Ordered real Schur form and a Sylvester equation; E = I in the results. system must be dense.
     """
-    explicit = system.explicit()
+    explicit = system.explicit
     triangle, basis, n_stable = scipy.linalg.schur(explicit.a, sort=lambda re, im: re < 0)
     k = int(n_stable)
     # T11 X - X T22 = -T12 makes [[I, X], [0, I]] the change of basis that decouples.

@@ -214,7 +214,10 @@ def _smallest(
 
     def attempt(order: int) -> DiagonalSystem | None:
         nonlocal best
-        reduced = family.at(order)
+        try:
+            reduced = family.at(order)
+        except ReductionError:  # poles that nearly coincide have no diagonal form; other orders do
+            return None
         # Between the samples only the reduced model's own resonances can stand out.
         own = np.setdiff1d(band_frequencies((reduced,), band_hz), omega)
         error = float(np.max(relative_errors(full, response(reduced, omega))))

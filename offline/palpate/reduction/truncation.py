@@ -21,7 +21,7 @@ from palpate.diagonal_system import DiagonalSystem
 from palpate.reduction.balancing import Balancing, Gramians, Realisation, balance
 from palpate.reduction.block_form import diagonalise
 from palpate.reduction.errors import ReductionError
-from palpate.reduction.frequencies import band_frequencies, relative_errors, spectral_norms
+from palpate.reduction.frequencies import frequencies_near, relative_errors, spectral_norms
 from palpate.reduction.gramians import (
     band_controllability_factor,
     band_quadrature,
@@ -154,12 +154,12 @@ def modal_truncation(
     tolerance     bound over the largest |G|, sampled at the resonances and at 0
 
     The bound is the sum of |c_k b_k^T| / |Re lambda_k| over the dropped poles, with and without their statics.
-    Raises ValueError where A has no well-conditioned basis of eigenvectors.
+    Raises ReductionError where A has no well-conditioned basis of eigenvectors.
     """
     part = prepare(system, order, tolerance, unstable)
     stable = part.stable
     if isinstance(stable, LinearSystem):
-        dense = stable.explicit()
+        dense = stable.explicit
         stable = diagonalise(dense.a, dense.b, dense.c, dense.d)
     ascending = np.argsort(np.abs(stable.poles), kind="stable")
     stable = stable.take(ascending)
@@ -206,7 +206,7 @@ class Prepared:
         if isinstance(stable, DiagonalSystem):
             return gramians(stable, _GRAMIAN_TOLERANCE)
         if not stable.is_sparse:
-            return Gramians(*gramian_factors(stable.a, stable.b, stable.c))
+            return Gramians(*gramian_factors(stable))
         e = stable.e
         try:
             control = low_rank_factor(stable.a, e, stable.b)
@@ -259,7 +259,7 @@ def _stable_part(system: System, unstable: Unstable) -> tuple[System, LinearSyst
     if isinstance(system, LinearSystem):
         if system.is_sparse and system.n_states > DENSE_STATES:
             return system, None  # its Gramians do not converge unless it is stable
-        system = system.explicit()
+        system = system.explicit
     abscissa = system.spectral_abscissa
     if abscissa < 0:
         return system, None
@@ -294,10 +294,8 @@ def _smallest_in_band(
     band_hz: tuple[float, float],
     tolerance: float,
 ) -> int:
-    known = (system,) if isinstance(system, DiagonalSystem) else ()
-    largest = balancing.truncated(realisation, balancing.rank)
-    lossless = diagonalise(largest.a, largest.b, largest.c, largest.d)
-    omega = band_frequencies((*known, lossless), band_hz)
+    lossless = balancing.truncated(realisation, balancing.rank)
+    omega = frequencies_near(system.poles if isinstance(system, DiagonalSystem) else lossless.poles, band_hz)
     full = system.transfer(1j * omega)
     best = (math.inf, 0)
 
