@@ -12,19 +12,14 @@ import argparse
 import shutil
 import statistics
 import subprocess
-import sys
 import tempfile
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
-import msgpack
-import zenoh
-from round_trip import client_config, encode_command, end, free_endpoint, start
-
 from palpate.model import load_model, save_model
-from palpate_server import realtime, wire
+from palpate_server import realtime
+from palpate_server.round_trips import through_a_model
 from palpate_server.sample_model import spring_mass_model
 
 
@@ -75,42 +70,13 @@ def measure(
     folder: Path, path: Path, contact: str, seconds: float, fifo: bool
 ) -> tuple[dict[str, Any], tuple[float, float]]:
     """The server's last status, and p50 and p99 of cyclictest beside it, in microseconds."""
-    endpoint = free_endpoint()
-    server = start([sys.executable, "-m", "palpate_server", str(path), "--listen", endpoint], "serving")
-    statuses: list[dict[str, Any]] = []
+    output = folder / "cyclictest.txt"  # more text than a pipe holds
+    bare = cyclictest(seconds, fifo, output)
     try:
-        with zenoh.open(client_config(endpoint)) as session:
-            keys = wire.Keys("main")
-            token = session.liveliness().declare_token(keys.client("bench"))
-            request = wire.pack({"client": "bench", "contacts": [contact]})
-            granted = False
-            while not granted:
-                granted = any(r.ok for r in session.get(keys.control("acquire"), payload=request, timeout=2))
-            subscribers = [
-                session.declare_subscriber(keys.surface, lambda sample: None),
-                session.declare_subscriber(keys.force, lambda sample: None),
-                session.declare_subscriber(
-                    keys.status, lambda sample: statuses.append(msgpack.unpackb(sample.payload.to_bytes()))
-                ),
-            ]
-            publisher = session.declare_publisher(
-                keys.command("bench"), priority=zenoh.Priority.REAL_TIME, express=True
-            )
-            output = folder / "cyclictest.txt"  # more text than a pipe holds
-            bare = cyclictest(seconds, fifo, output)
-            started = time.monotonic()
-            sequence = 0
-            while bare.poll() is None:
-                sequence += 1
-                publisher.put(encode_command(contact, sequence, time.monotonic_ns()))
-                wait = started + sequence * 1e-3 - time.monotonic()
-                if wait > 0:
-                    time.sleep(wait)
-            for declared in (*subscribers, token):
-                declared.undeclare()
-            return statuses[-1], read_histogram(output.read_text())
+        _, status = through_a_model(path, contact, seconds)
     finally:
-        end(server)
+        bare.wait()
+    return status, read_histogram(output.read_text())
 
 
 def cyclictest(seconds: float, fifo: bool, output: Path) -> subprocess.Popen[str]:

@@ -170,7 +170,7 @@ def make_model(system: StateSpace, displacement: Floats | None = None) -> Model:
         blocks = np.empty((system.order // 2, 2, 2))
         blocks[:, 0, 0], blocks[:, 1, 1] = 1 - system.diagonal[0::2], 1 - system.diagonal[1::2]
         blocks[:, 0, 1], blocks[:, 1, 0] = -system.cross[0::2], -system.cross[1::2]
-        state = np.linalg.solve(blocks, drive).ravel()
+        state[:] = np.linalg.solve(blocks, drive).ravel()
     return Model(
         diagonal=system.diagonal.copy(),
         cross=system.cross.copy(),

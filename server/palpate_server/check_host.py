@@ -1,0 +1,230 @@
+"""Is this machine fit to serve forces to a hand? Measures what counts, gives a verdict, and says what to change.
+
+    python -m palpate_server.check_host [--seconds 10]
+
+Exit code 0: good or marginal. 1: not sufficient. 2: it could not be measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from palpate.model import save_model
+from palpate_server import loop, realtime, telemetry, transport
+from palpate_server.image import make_image
+from palpate_server.round_trips import RoundTrips, ping_pong, through_a_model
+from palpate_server.safety import Limits
+from palpate_server.sample_model import spring_mass_model
+
+GOOD, MARGINAL, NOT_SUFFICIENT = "good", "marginal", "not sufficient"
+_TIMER_S = 3.0
+_COMMAND_BYTES, _FORCE_BYTES = 90, 220
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was measured: its value as text, the verdict on it, and what to do when it is not good."""
+
+    name: str
+    value: str
+    verdict: str
+    advice: str = ""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """A value up to `good` is good, up to `marginal` marginal, above not sufficient."""
+
+    good: float
+    marginal: float
+
+    def judge(self, value: float) -> str:
+        if value <= self.good:
+            return GOOD
+        return MARGINAL if value <= self.marginal else NOT_SUFFICIENT
+
+
+# A hand feels what happens within a few milliseconds; a tick has one.
+TIMER_LATENESS_P99_S = Bounds(100e-6, 500e-6)
+ROUND_TRIP_P99_S = Bounds(1e-3, 3e-3)
+LATE_SHARE = Bounds(0.001, 0.01)
+SKIPPED_SHARE = Bounds(0.0, 0.001)
+LOAD_PER_CPU = Bounds(0.3, 0.8)
+
+
+def worst(verdicts: Sequence[str]) -> str:
+    return max(verdicts, key=(GOOD, MARGINAL, NOT_SUFFICIENT).index)
+
+
+def settings() -> list[Finding]:
+    """What the kernel and this user's limits allow. None of it alone makes a machine insufficient."""
+    findings = []
+    cpus = len(os.sched_getaffinity(0))
+    findings.append(
+        Finding("processors", str(cpus), GOOD if cpus >= 2 else MARGINAL, "give the server two processors")
+    )
+    load = os.getloadavg()[0] / cpus
+    findings.append(
+        Finding(
+            "load per processor", f"{load:.2f}", min_marginal(LOAD_PER_CPU.judge(load)), "stop other programs"
+        )
+    )
+    preempt = Path("/sys/kernel/realtime")
+    real_time = preempt.is_file() and preempt.read_text().strip() == "1"
+    findings.append(
+        Finding(
+            "real-time kernel",
+            "yes" if real_time else "no",
+            GOOD if real_time else MARGINAL,
+            "a PREEMPT_RT kernel",
+        )
+    )
+    governor = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    if governor.is_file():
+        name = governor.read_text().strip()
+        findings.append(
+            Finding(
+                "frequency governor",
+                name,
+                GOOD if name == "performance" else MARGINAL,
+                "cpupower frequency-set -g performance",
+            )
+        )
+    refusal = _try_priority()
+    findings.append(
+        Finding("real-time priority", refusal or "allowed", MARGINAL if refusal else GOOD, refusal or "")
+    )
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    locked = soft == resource.RLIM_INFINITY or os.geteuid() == 0
+    findings.append(
+        Finding(
+            "locked memory",
+            "unlimited" if locked else f"{soft} bytes",
+            GOOD if locked else MARGINAL,
+            "ulimit -l unlimited",
+        )
+    )
+    return findings
+
+
+def min_marginal(verdict: str) -> str:
+    """A setting is a hint; the verdict comes from what is measured."""
+    return MARGINAL if verdict == NOT_SUFFICIENT else verdict
+
+
+def _try_priority() -> str | None:
+    result: list[str | None] = []
+    thread = threading.Thread(target=lambda: result.append(realtime.raise_priority()))
+    thread.start()
+    thread.join()
+    return result[0]
+
+
+def timer(seconds: float = _TIMER_S) -> Finding:
+    """Lateness of the deadline loop alone."""
+    model = spring_mass_model(n_modes=2)
+    memory = loop.make_memory(model.discrete, model.period_s, [Limits(1.0, 1.0, 1.0, 1.0, 0.0)], 1.0)
+    image = make_image(memory)
+    loop.stop(memory.shared)
+    wake = os.eventfd(0)
+    loop.run_at_deadlines(image, wake)  # compiled
+    memory.shared[loop.STOP] = 0
+    memory.shared[loop.DEADLINE_NS] = time.monotonic_ns()
+
+    def run() -> None:
+        realtime.raise_priority()
+        loop.run_at_deadlines(image, wake)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    time.sleep(seconds)
+    loop.stop(memory.shared)
+    thread.join()
+    os.close(wake)
+    lateness = telemetry.percentiles(
+        memory.histograms[loop.TIMER_LATENESS], int(memory.longest_ns[loop.TIMER_LATENESS])
+    )
+    p50, p99 = lateness["p50"], lateness["p99"]
+    assert p50 is not None
+    assert p99 is not None
+    return Finding(
+        "timer lateness",
+        f"p50 {p50 * 1e6:.0f} us, p99 {p99 * 1e6:.0f} us",
+        TIMER_LATENESS_P99_S.judge(p99),
+        "allow real-time priority, use a real-time kernel, stop other programs",
+    )
+
+
+def transport_round_trip(seconds: float = _TIMER_S) -> Finding:
+    trips = ping_pong(_COMMAND_BYTES, _FORCE_BYTES, seconds)
+    return Finding(
+        "Zenoh round trip",
+        _text(trips),
+        ROUND_TRIP_P99_S.judge(trips.p99_s),
+        "stop other programs; check what else uses the loopback device",
+    )
+
+
+def tick_run(seconds: float) -> list[Finding]:
+    """A real server, a client at 1 kHz and a surface viewer."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "sample.npz"
+        save_model(spring_mass_model(n_modes=50), path)
+        trips, status = through_a_model(path, "tip", seconds)
+    late = status["late_ticks"] / max(status["ticks"], 1)
+    skipped = status["skipped_ticks"] / max(status["ticks"], 1)
+    return [
+        Finding(
+            "command to force", _text(trips), ROUND_TRIP_P99_S.judge(trips.p99_s), "see timer and round trip"
+        ),
+        Finding("late ticks", f"{late:.3%}", LATE_SHARE.judge(late), "allow real-time priority"),
+        Finding("skipped ticks", f"{skipped:.3%}", SKIPPED_SHARE.judge(skipped), "stop other programs"),
+    ]
+
+
+def _text(trips: RoundTrips) -> str:
+    return (
+        f"p50 {trips.p50_s * 1e6:.0f} us, p99 {trips.p99_s * 1e6:.0f} us, {trips.unanswered:.2%} unanswered"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="palpate check-host", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of the tick run (%(default)s s)")
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+    options = parser.parse_args(arguments)
+    if not options.seconds > 0:
+        parser.error(f"--seconds is {options.seconds}: expected a number above 0")
+    hints = settings()
+    try:
+        measured = [timer(), transport_round_trip(), *tick_run(options.seconds)]
+    except transport.TransportError as error:
+        print(f"palpate check-host: {error}", file=sys.stderr)
+        return 2
+    verdict = worst([finding.verdict for finding in measured])
+    if options.json:
+        print(
+            json.dumps({"verdict": verdict, "findings": [asdict(f) for f in (*hints, *measured)]}, indent=2)
+        )
+    else:
+        for finding in (*hints, *measured):
+            print(f"{finding.name:20} {finding.verdict:15} {finding.value}")
+        print(f"\nverdict: {verdict}")
+        for finding in (*hints, *measured):
+            if finding.verdict != GOOD:
+                print(f"  {finding.name}: {finding.advice}")
+    return 1 if verdict == NOT_SUFFICIENT else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
