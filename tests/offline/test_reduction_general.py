@@ -317,6 +317,14 @@ def test_an_unstable_system_is_refused_or_split_as_the_caller_says(method):
     assert reduced.system.transfer(s) == pytest.approx(alone, rel=1e-6, abs=1e-6)
 
 
+def test_an_undamped_system_is_refused_even_where_round_off_moves_its_poles_to_the_left():
+    undamped = chain(20, 0.0)
+    assert np.any(undamped.poles.real < 0)
+    for method in WITH_BOUND:
+        with pytest.raises(ReductionError, match="not stable"):
+            method(undamped, 6)
+
+
 def test_splitting_and_adding_gives_the_system_back():
     system = random_system(8, 15, 2, 3, damping=-2.0)
     stable, rest = split(system)

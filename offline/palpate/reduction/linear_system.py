@@ -102,6 +102,11 @@ class LinearSystem:
         """Largest real part of the poles; minus infinity without states."""
         return float(np.max(self.poles.real, initial=-np.inf))
 
+    @property
+    def pole_round_off(self) -> float:
+        """What the real parts of the poles are uncertain by at least, 1/s: a pole nearer to the axis may lie on it."""
+        return 1e-13 * float(np.max(np.abs(self.poles), initial=0.0))
+
     def transfer(self, s: NDArray[np.complexfloating[Any, Any]]) -> Complex:
         """(n_points, n_outputs, n_inputs): C (s E - A)^-1 B + D at the points s (n_points,)."""
         return self.c @ self.solutions(s) + self.d
@@ -134,12 +139,13 @@ def _dense(matrix: Matrix) -> Array:
 
 
 def split(system: LinearSystem) -> tuple[LinearSystem, LinearSystem]:
-    """(stable, rest): the poles with Re < 0 and the others; the two transfer functions add up, D with the first.
+    """(stable, rest): the poles with Re < 0 by more than round-off, and the others; they add up, D with the first.
 
     Ordered real Schur form and a Sylvester equation; E = I in the results. system must be dense.
     """
     explicit = system.explicit
-    triangle, basis, n_stable = scipy.linalg.schur(explicit.a, sort=lambda re, im: re < 0)
+    limit = -system.pole_round_off
+    triangle, basis, n_stable = scipy.linalg.schur(explicit.a, sort=lambda re, im: re < limit)
     k = int(n_stable)
     # T11 X - X T22 = -T12 makes [[I, X], [0, I]] the change of basis that decouples.
     x = scipy.linalg.solve_sylvester(triangle[:k, :k], -triangle[k:, k:], -triangle[:k, k:])

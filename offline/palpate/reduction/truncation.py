@@ -261,11 +261,11 @@ def _stable_part(system: System, unstable: Unstable) -> tuple[System, LinearSyst
             return system, None  # its Gramians do not converge unless it is stable
         system = system.explicit
     abscissa = system.spectral_abscissa
-    if abscissa < 0:
+    if abscissa < (-system.pole_round_off if isinstance(system, LinearSystem) else 0):
         return system, None
     if unstable == "refuse":
         raise ReductionError(
-            f"the system is not stable: its spectral abscissa is {abscissa:.3g} 1/s, expected below 0 "
+            f"the system is not stable: its spectral abscissa is {abscissa:.3g} 1/s, expected below 0 by more than round-off "
             "(unstable='split' sets the unstable part aside)"
         )
     if isinstance(system, LinearSystem):
