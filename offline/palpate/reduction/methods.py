@@ -58,15 +58,17 @@ class Reduction:
 
 
 @dataclass(frozen=True)
-class _Family:
-    """The reduced systems of one method.
+class Family:
+    """All reduced systems of one method: what is common to them is computed once.
 
-    orders  the orders it has, ascending
-    at      the system of an order
+    orders     the orders it has, ascending
+    at         the system of one of them; its stability is for the caller to look at
+    balancing  None for modal methods
     """
 
     orders: NDArray[np.intp]
     at: Callable[[int], DiagonalSystem]
+    balancing: Balancing | None = None
 
 
 def reduce(
@@ -95,18 +97,8 @@ def reduce(
     Raises ReductionError where the system is not stable (nothing is reduced silently then), the order is too
     small for the method, or the tolerance is not reached; ValueError for arguments out of range.
     """
-    _check_arguments(method, order, tolerance, band_hz)
-    _check_stability(system)
-    singular_values: Array = np.zeros(0)
-    bound: float | None = None
-    if method == "tbr":
-        family, balancing = _balanced(system, gramians(system, _GRAMIAN_TOLERANCE))
-        singular_values = balancing.sigma
-    elif method == "tbr-band":
-        family, balancing = _balanced(system, _band_limited(system, band_hz))
-        singular_values = balancing.sigma
-    else:
-        family = _modal(system, keep_statics=method == "modal-static")
+    _check_arguments(order, tolerance)
+    family = reductions(system, method, band_hz)
     if order is not None:
         chosen = _available(family.orders, order, method)
         reduced = family.at(chosen)
@@ -118,28 +110,37 @@ def reduce(
             f"{method} at order {chosen} has a spectral abscissa of {reduced.spectral_abscissa:.3g} 1/s, "
             "expected below 0: choose another order"
         )
-    if method == "tbr":
-        bound = 2 * balancing.tail(chosen)
+    balancing = family.balancing
+    singular_values = np.zeros(0) if balancing is None else balancing.sigma
+    bound = 2 * balancing.tail(chosen) if method == "tbr" and balancing is not None else None
     return Reduction(method, reduced, singular_values, bound)
+
+
+def reductions(system: DiagonalSystem, method: Method, band_hz: tuple[float, float] = (0.0, 30.0)) -> Family:
+    """The reduced systems of a method at every order it has; arguments and errors as in `reduce`."""
+    if method not in METHODS:
+        raise ValueError(f"method = {method!r}: expected one of {', '.join(METHODS)}")
+    if not 0 <= band_hz[0] < band_hz[1] < math.inf:
+        raise ValueError(f"band_hz = {band_hz}: expected (low, high) with 0 <= low < high")
+    _check_stability(system)
+    if method == "tbr":
+        return _balanced(system, gramians(system, _GRAMIAN_TOLERANCE))
+    if method == "tbr-band":
+        return _balanced(system, _band_limited(system, band_hz))
+    return _modal(system, keep_statics=method == "modal-static")
 
 
 def _continuous(system: DiagonalSystem, omega: Array) -> NDArray[np.complex128]:
     return system.transfer(1j * omega)
 
 
-def _check_arguments(
-    method: str, order: int | None, tolerance: float | None, band_hz: tuple[float, float]
-) -> None:
-    if method not in METHODS:
-        raise ValueError(f"method = {method!r}: expected one of {', '.join(METHODS)}")
+def _check_arguments(order: int | None, tolerance: float | None) -> None:
     if (order is None) == (tolerance is None):
         raise ValueError(f"order = {order} and tolerance = {tolerance}: expected exactly one of them")
     if order is not None and order < 1:
         raise ValueError(f"order = {order}: expected at least 1")
     if tolerance is not None and not 0 < tolerance < math.inf:
         raise ValueError(f"tolerance = {tolerance}: expected a number above 0")
-    if not 0 <= band_hz[0] < band_hz[1] < math.inf:
-        raise ValueError(f"band_hz = {band_hz}: expected (low, high) with 0 <= low < high")
 
 
 def _check_stability(system: DiagonalSystem) -> None:
@@ -157,7 +158,7 @@ def _check_stability(system: DiagonalSystem) -> None:
         )
 
 
-def _balanced(system: DiagonalSystem, gramians: Gramians) -> tuple[_Family, Balancing]:
+def _balanced(system: DiagonalSystem, gramians: Gramians) -> Family:
     form = real_form(system)
     balancing = balance(form, gramians)
 
@@ -165,7 +166,7 @@ def _balanced(system: DiagonalSystem, gramians: Gramians) -> tuple[_Family, Bala
         reduced = balancing.truncated(form, order)
         return diagonalise(reduced.a, reduced.b, reduced.c, reduced.d)
 
-    return _Family(np.arange(1, balancing.rank + 1), at), balancing
+    return Family(np.arange(1, balancing.rank + 1), at, balancing)
 
 
 def _band_limited(system: DiagonalSystem, band_hz: tuple[float, float]) -> Gramians:
@@ -174,7 +175,7 @@ def _band_limited(system: DiagonalSystem, band_hz: tuple[float, float]) -> Grami
     return Gramians(control, gramians(system, _GRAMIAN_TOLERANCE).observe)
 
 
-def _modal(system: DiagonalSystem, *, keep_statics: bool) -> _Family:
+def _modal(system: DiagonalSystem, *, keep_statics: bool) -> Family:
     """The groups of lowest number, that is the relaxation of the static stiffness and the slowest modes."""
     sizes = np.bincount(system.group, weights=np.where(system.is_pair, 2, 1)).astype(np.intp)
     orders = np.unique(np.cumsum(sizes))
@@ -188,7 +189,7 @@ def _modal(system: DiagonalSystem, *, keep_statics: bool) -> _Family:
         d = system.d + system.static_gain() - reduced.static_gain()
         return DiagonalSystem(reduced.poles, reduced.b, reduced.c, d, reduced.group)
 
-    return _Family(orders, at)
+    return Family(orders, at)
 
 
 def _available(orders: NDArray[np.intp], order: int, method: str) -> int:
@@ -201,7 +202,7 @@ def _available(orders: NDArray[np.intp], order: int, method: str) -> int:
 
 def _smallest(
     system: DiagonalSystem,
-    family: _Family,
+    family: Family,
     tolerance: float,
     band_hz: tuple[float, float],
     method: str,
