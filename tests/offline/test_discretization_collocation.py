@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.discretization import collocation
+from palpate.discretization.nodal import NodalValues
 from palpate.discretization.stability import stability
 from palpate.geometry.shapes import ball, box_lattice
 from palpate.material import PRESETS, PronySeries
@@ -33,10 +34,20 @@ def _top_centre(cloud):
     return np.flatnonzero(distance < distance.min() + 1e-9)
 
 
-def test_linear_fields_have_exact_tractions_and_no_body_force_and_rigid_motions_have_neither(cloud):
+def _rows(cloud):
+    """Functions of node indices: the rows of momentum and of traction, acting on nodal values."""
     operators = collocation.Operators(cloud, CUBE, 2.2)
+    values = NodalValues(operators.h.value)
+    return (
+        lambda nodes: values.vector_operator(operators.divergence_of_stress(nodes)),
+        lambda nodes: values.vector_operator(operators.traction(nodes)),
+    )
+
+
+def test_linear_fields_have_exact_tractions_and_no_body_force_and_rigid_motions_have_neither(cloud):
+    divergence_of_stress, traction_rows = _rows(cloud)
     inside, surface = np.flatnonzero(~cloud.boundary), np.flatnonzero(cloud.boundary)
-    divergence, traction = operators.divergence_of_stress(inside), operators.traction(surface)
+    divergence, traction = divergence_of_stress(inside), traction_rows(surface)
     rotation = np.array([[0, -0.4, 0.2], [0.4, 0, -0.7], [-0.2, 0.7, 0]])
     strain = np.array([[0.3, 0.7, -0.2], [0.1, -0.4, 0.5], [0.6, 0.2, 0.9]])
     for gradient in (np.zeros((3, 3)), rotation, strain):
@@ -51,12 +62,12 @@ def test_linear_fields_have_exact_tractions_and_no_body_force_and_rigid_motions_
 
 def test_the_patch_test_is_solved_exactly(cloud):
     """A linear field prescribed on the whole boundary is the solution inside."""
-    operators = collocation.Operators(cloud, CUBE, 2.2)
+    divergence_of_stress, _ = _rows(cloud)
     inside = np.flatnonzero(~cloud.boundary)
     strain = np.array([[0.3, 0.7, -0.2], [0.1, -0.4, 0.5], [0.6, 0.2, 0.9]])
     exact = (cloud.points @ strain.T).ravel()
     free = (3 * inside[:, None] + np.arange(3)).ravel()
-    rows = operators.divergence_of_stress(inside)
+    rows = divergence_of_stress(inside)
     known = np.delete(rows, free, axis=1) @ np.delete(exact, free)
     np.testing.assert_allclose(np.linalg.solve(rows[:, free], -known), exact[free], atol=1e-11)
 
@@ -65,18 +76,18 @@ def test_modes_satisfy_momentum_inside_and_zero_traction_on_the_free_surface():
     cloud, bottom = _cube(6, 0.1)
     tip = _top_centre(cloud)
     modes = collocation.elastic_modes(cloud, CUBE, bottom, [tip])
-    operators = collocation.Operators(cloud, CUBE, 2.2)
+    divergence_of_stress, traction_rows = _rows(cloud)
     held = np.concatenate([bottom, tip])
     surface = np.setdiff1d(np.flatnonzero(cloud.boundary), held)
     inside = np.flatnonzero(~cloud.boundary)
     shapes = modes.shapes / np.linalg.norm(modes.shapes, axis=0)
-    divergence = operators.divergence_of_stress(inside)
+    divergence = divergence_of_stress(inside)
     inertia = (
         -CUBE.density_kg_per_m3 * shapes.reshape(cloud.n_nodes, 3, -1)[inside] * modes.squared_frequencies
     )
     scale = 1e-11 * np.abs(divergence).sum(axis=1).max()
     np.testing.assert_allclose(divergence @ shapes, inertia.reshape(len(divergence), -1), atol=scale)
-    traction = operators.traction(surface)
+    traction = traction_rows(surface)
     scale = 1e-11 * np.abs(traction).sum(axis=1).max()
     np.testing.assert_allclose(traction @ shapes, 0, atol=scale)
     np.testing.assert_allclose(traction @ modes.patch_shapes, 0, atol=scale)
@@ -87,26 +98,24 @@ def test_the_static_force_is_the_traction_of_the_static_solution_times_its_area(
     cloud, bottom = _cube(6, 0.1)
     tip = _top_centre(cloud)
     modes = collocation.elastic_modes(cloud, CUBE, bottom, [tip])
-    operators = collocation.Operators(cloud, CUBE, 2.2)
+    divergence_of_stress, traction_rows = _rows(cloud)
     # All rows at once, nothing eliminated.
     inside = np.flatnonzero(~cloud.boundary)
     surface = np.setdiff1d(np.flatnonzero(cloud.boundary), np.concatenate([bottom, tip]))
     free = (3 * np.concatenate([inside, surface])[:, None] + np.arange(3)).ravel()
-    rows = np.vstack([operators.divergence_of_stress(inside), operators.traction(surface)])
+    rows = np.vstack([divergence_of_stress(inside), traction_rows(surface)])
     tip_motion = modes.patch_shapes.copy()
     tip_motion[free] = 0
     solution = tip_motion.copy()
     solution[free] = np.linalg.solve(rows[:, free], -rows @ tip_motion)
-    force = np.einsum(
-        "k,kai->ai", cloud.areas[tip], (operators.traction(tip) @ solution).reshape(len(tip), 3, 3)
-    )
+    force = np.einsum("k,kai->ai", cloud.areas[tip], (traction_rows(tip) @ solution).reshape(len(tip), 3, 3))
     np.testing.assert_allclose(modes.static_stiffness, force, atol=1e-9 * np.abs(force).max())
 
 
-@pytest.mark.parametrize("tip", ["none", "one node", "four nodes"])
+@pytest.mark.parametrize("tip", ["one node", "four nodes"])
 def test_all_poles_of_the_papers_cube_are_in_the_left_half_plane(tip):
     cloud, bottom = _cube(10)
-    contacts = {"none": [], "one node": [_top_centre(cloud)[:1]], "four nodes": [_top_centre(cloud)]}[tip]
+    contacts = {"one node": [_top_centre(cloud)[:1]], "four nodes": [_top_centre(cloud)]}[tip]
     modes = collocation.elastic_modes(cloud, CUBE, bottom, contacts)
     judged = stability(modes, CUBE.prony)
     assert judged.growing_modes == 0

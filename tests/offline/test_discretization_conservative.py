@@ -40,7 +40,8 @@ def _cube(n, jitter=0.0):
 
 
 def _top(cloud, radius):
-    return np.flatnonzero(np.linalg.norm(cloud.points - [0.5, 0.5, 1], axis=1) < radius)
+    away = np.linalg.norm(cloud.points[:, :2] - 0.5, axis=1)
+    return np.flatnonzero((away < radius) & (cloud.points[:, 2] == 1))
 
 
 def _cube_error(n, jitter):

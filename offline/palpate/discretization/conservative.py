@@ -15,15 +15,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh
-from scipy.sparse import csr_array, eye_array, hstack
+from scipy.sparse import csr_array, diags_array, eye_array, hstack, kron
 
 from palpate.discretization.consistency import consistent_gradient, vector_areas
 from palpate.discretization.nodal import NodalValues, nodal_shape_functions
-from palpate.discretization.supports import Supports, supports
+from palpate.discretization.supports import Supports, components, supports
 from palpate.geometry.cloud import NodeCloud
 from palpate.material import Material
 from palpate.meshfree import ShapeFunctions
 from palpate.system import ElasticModes
+from palpate.time_integration import EquationsOfMotion, with_multipliers
 
 SUPPORT_RADIUS_FACTOR = 2.2
 """Support radius over node spacing: frequencies of lattices and jittered clouds alike are most accurate near it."""
@@ -61,7 +62,7 @@ def elastic_modes(
     vectors *= inverse_root_mass[:, None]
     input_coupling = vectors.T @ coupling
     shapes = np.zeros((3 * cloud.n_nodes, size))
-    shapes[(3 * held.free[:, None] + np.arange(3)).ravel()] = vectors
+    shapes[components(held.free, 3)] = vectors
     return ElasticModes(
         squared_frequencies=squared_frequencies,
         input_coupling=input_coupling,
@@ -69,6 +70,42 @@ def elastic_modes(
         direct_stiffness=direct,
         shapes=shapes,
         patch_shapes=held.patch_shapes,
+    )
+
+
+def equations_of_motion(
+    cloud: NodeCloud,
+    material: Material,
+    fixed: ArrayLike,
+    contacts: Sequence[ArrayLike],
+    *,
+    support_radius_factor: float = SUPPORT_RADIUS_FACTOR,
+) -> EquationsOfMotion:
+    """The same model for time integration, sparse: in the shape functions' parameters, with multipliers as forces.
+
+    As in the modal model the held and driven nodes carry no mass. Raises as `elastic_modes`, but for the memory.
+    """
+    held = supports(cloud.n_nodes, fixed, contacts)
+    _require_volumes(cloud)
+    h, gradient = sparse_gradient(cloud, support_radius_factor)
+    lam, mu = material.lame_lambda_pa, material.shear_modulus_pa
+    volumes = diags_array(cloud.volumes)
+    products = [[g.T @ volumes @ f for f in gradient] for g in gradient]
+    trace = mu * (products[0][0] + products[1][1] + products[2][2])
+    stiffness = sum(
+        kron(lam * products[a][b] + mu * products[b][a] + (trace if a == b else 0 * trace), _unit(a, b))
+        for a in range(3)
+        for b in range(3)
+    )
+    density = np.zeros(cloud.n_nodes)
+    density[held.free] = material.density_kg_per_m3 * cloud.volumes[held.free]
+    mass = h.value.T @ diags_array(density) @ h.value
+    return with_multipliers(
+        csr_array(kron(mass, np.eye(3))),
+        csr_array(stiffness),
+        csr_array(kron(h.value, np.eye(3))),
+        components(held.prescribed, 3),
+        csr_array(kron(held.tips, np.eye(3))),
     )
 
 
@@ -114,6 +151,13 @@ def _kinematics(held: Supports) -> csr_array:
     """(n_nodes, n_free + n_contacts): nodal values from the free nodes' values and the tips'."""
     free = eye_array(held.n_nodes, format="csr")[:, held.free]
     return csr_array(hstack([free, held.tips]))
+
+
+def _unit(a: int, b: int) -> Array:
+    """(3, 3), 1 in row a and column b."""
+    unit = np.zeros((3, 3))
+    unit[a, b] = 1.0
+    return unit
 
 
 def _require_volumes(cloud: NodeCloud) -> None:

@@ -47,7 +47,9 @@ def consistent_gradient(
     ).transpose(2, 0, 1)
     inverse_moments = np.linalg.inv(moments)
     rows = (terms * node[:, None] + np.arange(terms)).ravel()
-    fit = csr_array(((weight[:, None] * linear).ravel(), (rows, np.repeat(other, 4))), shape=(terms * n, n))
+    fit = csr_array(
+        ((weight[:, None] * linear).ravel(), (rows, np.repeat(other, terms))), shape=(terms * n, n)
+    )
     share = volumes / spacing**2
     scale = volumes * share
     inner = bsr_array(

@@ -37,3 +37,10 @@ class NodalValues:
         return lu_solve(
             self._factor, matrix.T.toarray(order="F"), trans=1, overwrite_b=True, check_finite=False
         ).T
+
+    def vector_operator(self, matrix: csr_array) -> NDArray[np.float64]:
+        """(rows, 3 n_nodes): the same for a sparse A (rows, 3 n_nodes) that acts on x, y, z of node 0, then of node 1, ..."""
+        rows = np.empty(matrix.shape)
+        for component in range(3):
+            rows[:, component::3] = self.operator(matrix[:, component::3])
+        return rows

@@ -78,3 +78,8 @@ def supports(n_nodes: int, fixed: ArrayLike, contacts: Sequence[ArrayLike]) -> S
         raise ValueError(f"all {n_nodes} nodes are fixed or in a contact patch: expected some to be free")
     fixed_nodes, *patches = checked.values()
     return Supports(fixed_nodes, tuple(patches), free, n_nodes)
+
+
+def components(nodes: Indices, n: int) -> Indices:
+    """(n len(nodes),): the indices of the nodes' n components each, where those of node 0 come first."""
+    return (n * nodes[:, None] + np.arange(n)).ravel()
