@@ -161,6 +161,25 @@ def demo(
     summary.print(console)
 
 
+@app.command()
+def reproduce(
+    figure: Annotated[
+        list[int] | None,
+        typer.Option("--figure", help="Number of a figure, 2 to 16; again for more; default: all."),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the page paper.md and its images.")] = Path("out"),
+    quick: Annotated[bool, typer.Option("--quick", help="Small node clouds, about a minute.")] = False,
+) -> None:
+    """Regenerate the figures of BaniHani & De 2009, and three beyond them, each as a plot and a table."""
+    with stage_reporter() as report:
+        report("libraries")
+        from palpate.experiments.reproduce import reproduce
+
+        written = reproduce(figure or [], out, quick, report)
+    for path in written:
+        console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
 def _run_example(name: str, arguments: list[str]) -> None:
     """Become a client example, as installed."""
     path = str(files("palpate_client_examples") / name)

@@ -1,0 +1,66 @@
+"""One regenerated figure: its numbers, how to draw them, and what they say."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from palpate.plots import require_matplotlib
+
+Cell = str | float | int
+
+
+@dataclass(frozen=True)
+class Figure:
+    """What a figure of the page is made of.
+
+    number    2 to 13 as in BaniHani & De 2009; from 14 on, beyond it
+    title     one line
+    columns   header of the table, units in the names
+    rows      the table: every number that the plot shows
+    draw      draws onto an empty matplotlib figure
+    findings  what we find and why it differs from the paper, Markdown, computed from the rows
+    size      of the plot, inches
+    """
+
+    number: int
+    title: str
+    columns: tuple[str, ...]
+    rows: Sequence[Sequence[Cell]]
+    draw: Callable[[Any], None]
+    findings: str
+    size: tuple[float, float] = (9.0, 4.0)
+
+    @property
+    def stem(self) -> str:
+        return f"figure_{self.number:02d}"
+
+    def write(self, folder: Path) -> None:
+        """STEM.csv and STEM.png in the folder, which must exist."""
+        with (folder / f"{self.stem}.csv").open("w", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(self.columns)
+            writer.writerows([_text(cell) for cell in row] for row in self.rows)
+        require_matplotlib()
+        import matplotlib as mpl
+
+        mpl.use("Agg")
+        import matplotlib.pyplot as plt
+
+        canvas = plt.figure(figsize=self.size, layout="constrained")
+        self.draw(canvas)
+        canvas.savefig(folder / f"{self.stem}.png", dpi=100)
+        plt.close(canvas)
+
+
+def _text(cell: Cell) -> str:
+    return f"{cell:.6g}" if isinstance(cell, float) else str(cell)
+
+
+def tidy(axis: Any) -> None:
+    """The house style of a panel: light grid, two spines."""
+    axis.grid(alpha=0.25, which="both")
+    axis.spines[["top", "right"]].set_visible(False)

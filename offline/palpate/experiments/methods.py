@@ -1,0 +1,98 @@
+"""The reductions that the figures compare, each by the same call."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from palpate.diagonal_system import DiagonalSystem
+from palpate.reduction import (
+    ReducedSystem,
+    ReductionError,
+    balanced_truncation,
+    band_limited_truncation,
+    hankel_optimal,
+    modal_truncation,
+    singular_perturbation_balancing,
+)
+from palpate.reduction.block_form import diagonalise
+
+Band = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A reduction to `order` states, (system, band in Hz, order) -> ReducedSystem, and how plots show it."""
+
+    name: str
+    label: str
+    colour: str
+    marker: str
+    apply: Callable[[DiagonalSystem, Band, int], ReducedSystem]
+
+
+HOM = Method("HOM", "Hankel-optimal", "tab:green", "s", lambda g, band, r: hankel_optimal(g, r))
+MT = Method("MT", "modal truncation", "tab:orange", "^", lambda g, band, r: modal_truncation(g, r))
+TBR = Method(
+    "TBR", "truncated balanced realization", "tab:red", "o", lambda g, band, r: balanced_truncation(g, r)
+)
+MT_STATICS = Method(
+    "MT+statics",
+    "modal truncation with residual stiffness",
+    "tab:brown",
+    "v",
+    lambda g, band, r: modal_truncation(g, r, keep_statics=True),
+)
+SPB = Method(
+    "SPB",
+    "singular perturbation balancing",
+    "tab:purple",
+    "D",
+    lambda g, band, r: singular_perturbation_balancing(g, r),
+)
+BAND = Method(
+    "band-limited",
+    "band-limited truncation",
+    "tab:blue",
+    "*",
+    lambda g, band, r: band_limited_truncation(g, band, r),
+)
+
+OF_THE_PAPER = (HOM, MT, TBR)
+BEYOND = (MT_STATICS, SPB, BAND)
+ALL = OF_THE_PAPER + BEYOND
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """A reduced model in diagonal form.
+
+    order      number of states that the method reached, at most what was asked for
+    bound      on the largest error over all frequencies, units of the response; None without
+    seconds    that the reduction took, from the full model's poles and residues on
+    """
+
+    method: Method
+    order: int
+    system: DiagonalSystem
+    bound: float | None
+    seconds: float
+    hankel_singular_values: np.ndarray[tuple[int], np.dtype[np.float64]]
+
+
+def reduce_by(method: Method, system: DiagonalSystem, band_hz: Band, order: int) -> Reduced | None:
+    """The reduced model, or None where the method has none of that order (it says so by ReductionError)."""
+    start = time.perf_counter()
+    try:
+        reduced = method.apply(system, band_hz, order)
+    except ReductionError:
+        return None
+    plain = reduced.system
+    diagonal = diagonalise(plain.a, plain.b, plain.c, plain.d)
+    seconds = time.perf_counter() - start
+    return Reduced(
+        method, reduced.order, diagonal, reduced.error_bound, seconds, reduced.hankel_singular_values
+    )
