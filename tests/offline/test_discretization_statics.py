@@ -1,12 +1,16 @@
 """Statics without modes against statics with them, and against Boussinesq-type punch solutions."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from palpate.build import build_cloud
+from palpate.config import load_config
 from palpate.discretization import conservative
 from palpate.discretization.statics import static_stiffness
 from palpate.geometry.fill import fill_surface
-from palpate.geometry.regions import contact_patch
+from palpate.geometry.regions import PlaneRegion, contact_patch, nodes_in
 from palpate.geometry.shapes import box_lattice, box_surface
 from palpate.geometry.spacing import Refinement
 from palpate.material import Material
@@ -67,3 +71,21 @@ def test_the_bonded_punch_converges_further(punch):
     errors = np.abs(np.array([*punch, _punch_stiffness(1 / 4, 0.22)]) / REFERENCE - 1)
     assert errors[2] < errors[1] < errors[0]
     assert errors[2] < 0.02
+
+
+@pytest.mark.slow
+def test_the_livers_tip_stiffness_changes_by_less_than_five_percent_when_the_spacing_there_is_halved():
+    folder = Path(__file__).parents[2] / "configs"
+    config = load_config(folder / "liver.toml")
+    (tip,) = config.contact
+    (region,) = config.fixed
+    stiffness = []
+    for spacing in (tip.spacing_m, tip.spacing_m / 2):
+        contact = tip.model_copy(update={"spacing_m": spacing})
+        cloud = build_cloud(config.model_copy(update={"contact": [contact]}), folder)
+        patch = contact_patch(tip.point_m, tip.radius_m, cloud)
+        held = nodes_in(PlaneRegion(region.point_m, region.normal), cloud)
+        stiffness.append(static_stiffness(cloud, config.material.material(), held, [patch.nodes]))
+    coarse, fine = stiffness
+    np.testing.assert_allclose(np.linalg.eigvalsh(coarse), np.linalg.eigvalsh(fine), rtol=0.05)
+    assert np.linalg.norm(coarse - fine, 2) < 0.05 * np.linalg.norm(fine, 2)
