@@ -301,26 +301,47 @@ def set_frame(image: Image, contact: int, rotation: Floats, scale: float, origin
 
 
 @compiled
-def reset(image: Image) -> None:
-    """Put the model to rest, between two ticks; every force starts from zero again."""
+def set_limits(image: Image, contact: int, limits: Floats) -> int:
+    """Give a contact other limits, (5,), the fields of safety.Limits, between two ticks; the first that uses them."""
+    m = _memory(image)
+    _take_lock(m)
+    m.limits[contact] = limits
+    tick = m.counters[TICKS]
+    store_release(m.shared, LOCK, 0)
+    return tick
+
+
+@compiled
+def reset(image: Image) -> int:
+    """Put the model to rest, between two ticks; every force starts from zero again. Returns the first tick after it."""
     _take_lock(_memory(image))
     m = _memory(image)
     m.model.state[:] = 0.0
     m.next_model.state[:] = 0.0
     m.scale[:] = 0.0
+    tick = m.counters[TICKS]
     store_release(m.shared, LOCK, 0)
+    return tick
 
 
 @compiled
-def exchange(image: Image, replacement: Image) -> None:
-    """Let the loop go on with another memory, between two ticks.
+def exchange(image: Image, replacement: Image) -> int:
+    """Let the loop go on with another memory, between two ticks; the first tick that does.
 
     `replacement` is the image of the same memory with other `model`, `next_model`, `fade`, or snapshot arrays.
     """
     m = _memory(image)
     _take_lock(m)
     image[:] = replacement
+    tick = m.counters[TICKS]
     store_release(m.shared, LOCK, 0)
+    return tick
+
+
+@compiled
+def repeat_tick(image: Image, start_ns: int) -> None:
+    """Run the next tick as if it began at `start_ns`: for replays, where no other thread is at work."""
+    _run_tick(_memory(image), start_ns, start_ns, False)
 
 
 @compiled

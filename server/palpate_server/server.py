@@ -73,6 +73,9 @@ class Server:
         self._contact_index = {name: i for i, name in enumerate(self.names)}
         self._last_sequence = [-1] * len(self.names)
         self._state = "running"
+        self._undisturbed_since_tick = (
+            0  # by a reset or another model: until then a recording can be repeated
+        )
         self._events: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._stopping = threading.Event()
         self._wake = os.eventfd(0)
@@ -223,7 +226,14 @@ class Server:
     # Status and surface
 
     def publish_status(self) -> None:
-        status = telemetry.status(self._state, time.monotonic_ns(), self.memory, self.messages, self.leases)
+        status = telemetry.status(
+            self._state,
+            time.monotonic_ns(),
+            self.memory,
+            self.messages,
+            self.leases,
+            self._undisturbed_since_tick,
+        )
         self._status.put(wire.pack(status))
         if self._black_box is not None:
             self._black_box.examine()
@@ -363,7 +373,7 @@ class Server:
 
     def _set_terms(self, name: str, limits: Limits, frame: Frame) -> None:
         contact = self._contact_index[name]
-        self.memory.limits[contact] = limits
+        loop.set_limits(self.image, contact, np.array(limits))
         tick = loop.set_frame(
             self.image, contact, np.array(frame.rotation), frame.scale, np.array(frame.origin_m)
         )
@@ -392,13 +402,13 @@ class Server:
         for name in held:
             terms = self.leases.terms[name]
             limits = terms.limits._replace(**wanted)
-            self.memory.limits[self._contact_index[name]] = limits
-            self.leases.terms[name] = Terms(limits, terms.frame, terms.since_tick)
+            tick = loop.set_limits(self.image, self._contact_index[name], np.array(limits))
+            self.leases.terms[name] = Terms(limits, terms.frame, tick)
         return {"contacts": list(held), "limits": limits._asdict()}
 
     def _reset(self, client: str) -> dict[str, Any]:
         self._check_alone(client)
-        loop.reset(self.image)
+        self._undisturbed_since_tick = loop.reset(self.image)
         return {}
 
     def _check_alone(self, client: str) -> None:
@@ -419,7 +429,7 @@ class Server:
             following = loop.make_model(model.discrete, displacement)
             step = model.period_s / FADE_OVER_S
             fading = self.memory._replace(next_model=following, fade=np.array([0.0, step]))
-            loop.exchange(self.image, make_image(fading))
+            self._undisturbed_since_tick = loop.exchange(self.image, make_image(fading))
             while fading.fade[0] < 1.0:
                 if self._stopping.wait(model.period_s):
                     raise Refused("stopping", "the server is stopping")
@@ -512,6 +522,7 @@ def warm_up(period_s: float, n_contacts: int) -> None:
     loop.records_written(memory.shared)
     loop.is_silent(image, 0)
     loop.set_frame(image, 0, np.eye(3), 1.0, np.zeros(3))
+    loop.set_limits(image, 0, np.ones(5))
     loop.reset(image)
     loop.exchange(image, make_image(memory))
     loop.read_snapshot(image, np.zeros(2), np.zeros((n_contacts, 3)))

@@ -63,6 +63,7 @@ def status(
     memory: loop.Memory,
     messages: MessageCounters,
     leases: Leases,
+    undisturbed_since_tick: int,
 ) -> dict[str, Any]:
     """The status message; `state` is "running" or "stopping"."""
     ticks = memory.counters.tolist()
@@ -75,6 +76,7 @@ def status(
     return {
         "state": state,
         "server_time_ns": server_time_ns,
+        "undisturbed_since_tick": undisturbed_since_tick,
         "ticks": ticks[loop.TICKS],
         "ticks_on_arrival": ticks[loop.TICKS_ON_ARRIVAL],
         "late_ticks": ticks[loop.LATE_TICKS],

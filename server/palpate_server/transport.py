@@ -42,6 +42,7 @@ def open_session(listen: str | None, config_file: Path | None) -> zenoh.Session:
 def connect_session(endpoint: str, config_file: Path | None) -> zenoh.Session:
     """A session that connects to an endpoint, or one with exactly the configuration in a file. Raises TransportError."""
     settings = {
+        "mode": "client",
         "listen/endpoints": [],
         "connect/endpoints": [endpoint],
         "connect/timeout_ms": 2000,

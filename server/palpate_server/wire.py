@@ -21,6 +21,7 @@ ACTIONS = ("acquire", "release", "limits", "reset", "load")  # of control querie
 ENCODING = "application/msgpack;palpate.v1"
 MAX_COMMAND_BYTES = 4096
 MAX_REQUEST_BYTES = 16384
+MAX_RECORDED_BYTES = 2**20
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _MAX_INT64 = 2**63 - 1
@@ -140,7 +141,11 @@ def decode_command(payload: bytes) -> Command:
 
     Raises MalformedMessage. Fields that are not known are ignored, so that the schema can grow.
     """
-    message = unpack_map(payload, MAX_COMMAND_BYTES)
+    return read_command(unpack_map(payload, MAX_COMMAND_BYTES))
+
+
+def read_command(message: Mapping[str, Any]) -> Command:
+    """The tool command in a decoded map. Raises MalformedMessage."""
     displacement = _vectors(message, "displacement_m")
     if not displacement:
         raise MalformedMessage("wrong_shape", "displacement_m is empty: expected at least one contact")
