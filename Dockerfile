@@ -17,7 +17,7 @@ ENV PATH=/opt/palpate/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     NUMBA_CACHE_DIR=/home/palpate/.cache/numba \
     NUMBA_CPU_NAME=generic
-USER palpate
+USER 10001
 WORKDIR /models
 # The kernels are compiled here, as the user that will run them: the server then starts in under a second.
 RUN python -c "from palpate_server.server import warm_up; warm_up(0.001, 1)"

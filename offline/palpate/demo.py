@@ -20,7 +20,7 @@ from rich.console import Console
 
 from palpate.build import Report, build_model
 from palpate.config import fingerprint, load_config
-from palpate.diagonal_system import DiagonalSystem
+from palpate.diagonal_system import full_system
 from palpate.model import ModelFileError, ReducedModel, load_model, save_model
 from palpate.plots import Touch, draw_touch, require_matplotlib
 
@@ -122,10 +122,7 @@ def read_touch(recording: Path, model: ReducedModel) -> Touch:
     # Force messages are best effort: the displacement of a tick that was not heard is interpolated.
     ticks = np.arange(heard[0], heard[-1] + 1)
     every = np.stack([np.interp(ticks, heard, channel) for channel in applied.T], axis=1)
-    full = DiagonalSystem(
-        model.full.poles, model.full.b, model.full.c, model.full.d, np.arange(len(model.full.poles))
-    )
-    exact = full.response(every, model.period_s)[heard - heard[0]]
+    exact = full_system(model.full).response(every, model.period_s)[heard - heard[0]]
     return Touch((heard - heard[0]) * model.period_s, applied, force, scale * exact)
 
 

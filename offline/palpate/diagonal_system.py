@@ -9,6 +9,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from palpate.model import PoleResidueSystem
+
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
@@ -110,6 +112,11 @@ class DiagonalSystem:
         residues = products.reshape(len(self.poles), self.n_outputs * self.n_inputs)
         residues.imag[~self.is_pair] = 0.0
         return residues
+
+
+def full_system(full: PoleResidueSystem) -> DiagonalSystem:
+    """The unreduced system that a model file keeps."""
+    return DiagonalSystem(full.poles, full.b, full.c, full.d, np.arange(len(full.poles)))
 
 
 def first_order_hold(

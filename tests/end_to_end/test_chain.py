@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from palpate.demo import read_touch
-from palpate.diagonal_system import DiagonalSystem
+from palpate.diagonal_system import full_system
 from palpate.model import ReducedModel, load_model
 from palpate.plots import Touch
 from palpate.reduction.evidence import step_through
@@ -122,9 +122,7 @@ def test_the_served_force_is_the_full_models_within_the_error_that_the_file_stat
 ) -> None:
     """By Parseval, the force error in the band has at most error_in_band times the energy of |F| |u| there."""
     model, touch, _ = recorded
-    full = DiagonalSystem(
-        model.full.poles, model.full.b, model.full.c, model.full.d, np.arange(len(model.full.poles))
-    )
+    full = full_system(model.full)
     steady = np.all(touch.force_n[:, 3:] != 0, axis=1)  # a contact that nobody holds gives no force
     difference = touch.in_band((touch.force_n - touch.force_full_n)[:, 3:] * steady[:, None], model)
     frequencies = np.fft.rfftfreq(len(touch.time_s), model.period_s)
@@ -141,9 +139,7 @@ def test_the_stated_time_domain_error_is_found_again_from_the_file_alone(
     recorded: tuple[ReducedModel, Touch, dict[str, object]],
 ) -> None:
     model, _, _ = recorded
-    full = DiagonalSystem(
-        model.full.poles, model.full.b, model.full.c, model.full.d, np.arange(len(model.full.poles))
-    )
+    full = full_system(model.full)
     time = np.arange(5000) * model.period_s
     poke = 1e-3 * np.outer(np.sin(np.pi * time / 5) ** 4, np.ones(model.n_inputs))
     exact = full.response(poke, model.period_s)
