@@ -216,6 +216,7 @@ class Stages:
 
     def note(self, text: str) -> None:
         self._note = text
+        self._status.update(f"{self._name} ... {text}")
 
     def stop(self, failed: bool = False) -> None:
         self._status.stop()

@@ -245,5 +245,5 @@ def _order_table(by_method: dict[str, list[Error]], orders: dict[str, float]) ->
     lines += ["", f"Most accurate at the finest nodes: {most_accurate}."]
     stuck = [m for m, order in orders.items() if order < 0.5]
     if stuck:
-        lines[-1] += f" Not converging (observed order below 0.5): {', '.join(stuck)}."
+        lines[-1] += f" Not converging (observed order below 0.5): {'; '.join(stuck)}."
     return "\n".join(lines)

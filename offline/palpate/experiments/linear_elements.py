@@ -38,9 +38,11 @@ def membrane_modes(
 
     corners = Delaunay(points).simplices
     a, b, c = points[corners].transpose(1, 0, 2)
-    area = np.cross(b - a, c - a) / 2
+    (px, py), (qx, qy) = (b - a).T, (c - a).T
+    area = (px * qy - py * qx) / 2
     corners = corners[np.abs(area) > 1e-9 * np.abs(area).max()]
-    basis = Basis(MeshTri(points.T, corners.T), ElementTriP1(), intorder=8)
+    mesh = MeshTri(np.ascontiguousarray(points.T), np.ascontiguousarray(corners.T))
+    basis = Basis(mesh, ElementTriP1(), intorder=8)
     stiffness = BilinearForm(lambda u, v, w: dot(grad(u), grad(v))).assemble(basis).toarray()
     mass = BilinearForm(lambda u, v, w: u * v).assemble(basis).toarray()
 

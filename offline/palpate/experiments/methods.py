@@ -7,35 +7,40 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.diagonal_system import DiagonalSystem
 from palpate.reduction import (
     ReducedSystem,
+    Reduction,
     ReductionError,
     balanced_truncation,
     band_limited_truncation,
     hankel_optimal,
-    modal_truncation,
+    reduce,
     singular_perturbation_balancing,
 )
 from palpate.reduction.block_form import diagonalise
 
 Band = tuple[float, float]
+Apply = Callable[[DiagonalSystem, Band, int], ReducedSystem | Reduction]
 
 
 @dataclass(frozen=True)
 class Method:
-    """A reduction to `order` states, (system, band in Hz, order) -> ReducedSystem, and how plots show it."""
+    """A reduction to `order` states, by (system, band in Hz, order), and how plots show it."""
 
     name: str
     label: str
     colour: str
     marker: str
-    apply: Callable[[DiagonalSystem, Band, int], ReducedSystem]
+    apply: Apply
 
 
 HOM = Method("HOM", "Hankel-optimal", "tab:green", "s", lambda g, band, r: hankel_optimal(g, r))
-MT = Method("MT", "modal truncation", "tab:orange", "^", lambda g, band, r: modal_truncation(g, r))
+MT = Method("MT", "modal truncation", "tab:orange", "^", lambda g, band, r: reduce(g, "modal", order=r))
+"""The modes of lowest frequency, each with its memory; by modulus of the poles alone the slow memories would come first."""
+
 TBR = Method(
     "TBR", "truncated balanced realization", "tab:red", "o", lambda g, band, r: balanced_truncation(g, r)
 )
@@ -44,7 +49,7 @@ MT_STATICS = Method(
     "modal truncation with residual stiffness",
     "tab:brown",
     "v",
-    lambda g, band, r: modal_truncation(g, r, keep_statics=True),
+    lambda g, band, r: reduce(g, "modal-static", order=r),
 )
 SPB = Method(
     "SPB",
@@ -62,25 +67,25 @@ BAND = Method(
 )
 
 OF_THE_PAPER = (HOM, MT, TBR)
-BEYOND = (MT_STATICS, SPB, BAND)
-ALL = OF_THE_PAPER + BEYOND
+ALL = (*OF_THE_PAPER, MT_STATICS, SPB, BAND)
 
 
 @dataclass(frozen=True)
 class Reduced:
     """A reduced model in diagonal form.
 
-    order      number of states that the method reached, at most what was asked for
-    bound      on the largest error over all frequencies, units of the response; None without
-    seconds    that the reduction took, from the full model's poles and residues on
+    order                   number of states that the method reached, at most what was asked for
+    bound                   on the largest error over all frequencies, units of the response; None without
+    hankel_singular_values  (k,), largest first; empty for modal truncation
+    seconds                 that the reduction took, from the full model's poles and residues on
     """
 
     method: Method
     order: int
     system: DiagonalSystem
     bound: float | None
+    hankel_singular_values: NDArray[np.float64]
     seconds: float
-    hankel_singular_values: np.ndarray[tuple[int], np.dtype[np.float64]]
 
 
 def reduce_by(method: Method, system: DiagonalSystem, band_hz: Band, order: int) -> Reduced | None:
@@ -91,8 +96,8 @@ def reduce_by(method: Method, system: DiagonalSystem, band_hz: Band, order: int)
     except ReductionError:
         return None
     plain = reduced.system
-    diagonal = diagonalise(plain.a, plain.b, plain.c, plain.d)
+    diagonal = plain if isinstance(plain, DiagonalSystem) else diagonalise(plain.a, plain.b, plain.c, plain.d)
     seconds = time.perf_counter() - start
     return Reduced(
-        method, reduced.order, diagonal, reduced.error_bound, seconds, reduced.hankel_singular_values
+        method, reduced.order, diagonal, reduced.error_bound, reduced.hankel_singular_values, seconds
     )

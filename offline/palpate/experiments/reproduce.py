@@ -56,7 +56,7 @@ def reproduce(numbers: Sequence[int], out: Path, quick: bool, report: Report) ->
     require_matplotlib()
     images = out / "images" / "paper"
     images.mkdir(parents=True, exist_ok=True)
-    study = Study(quick)
+    study = Study(quick, report.note)
     figures, written = [], []
     for number in sorted(set(numbers) or FIGURES):
         report(f"figure {number}")

@@ -148,12 +148,15 @@ def ranking(values: dict[str, float], unit: Callable[[float], str]) -> str:
 
 def per_cent(fraction: float) -> str:
     """A fraction with two digits, in per cent."""
-    return f"{100 * fraction:.2g} %"
+    return f"{_two_digits(100 * fraction)} %"
 
 
 def seconds(value: float) -> str:
     """Seconds with two digits, in ms or µs where small."""
-    for scale, unit in ((1.0, "s"), (1e3, "ms"), (1e6, "µs")):
-        if value * scale >= 1 or unit == "µs":
-            return f"{value * scale:.2g} {unit}"
-    raise AssertionError("unreachable")
+    if value >= 1:
+        return f"{_two_digits(value)} s"
+    return f"{_two_digits(1e3 * value)} ms" if value >= 1e-3 else f"{_two_digits(1e6 * value)} µs"
+
+
+def _two_digits(value: float) -> str:
+    return f"{value:.0f}" if 100 <= value < 1e5 else f"{value:.2g}"
