@@ -1,7 +1,7 @@
 """One step of the discrete model in block-diagonal form: F = C xi + D u, then xi+ = A xi + B u, allocating nothing.
 
 The form is that of `palpate.model.StateSpace`: state i is coupled to itself and to its partner i XOR 1 alone, so a
-step costs O(order (n_inputs + n_outputs)).
+step costs O(order (n_inputs + n_outputs)). Inputs and outputs come in threes: x, y, z of each contact.
 """
 
 from __future__ import annotations
@@ -20,13 +20,17 @@ def output(c: Floats, d: Floats, state: Floats, displacement: Floats, force: Flo
 
     c (n_outputs, order), d (n_outputs, n_inputs), state (order,), displacement (n_inputs,) m, force (n_outputs,) N
     """
-    for row in range(c.shape[0]):
-        total = 0.0
+    for row in range(0, c.shape[0], 3):  # the three of a contact share what is loaded of the state
+        x = y = z = 0.0
         for i in range(c.shape[1]):
-            total += c[row, i] * state[i]
+            x += c[row, i] * state[i]
+            y += c[row + 1, i] * state[i]
+            z += c[row + 2, i] * state[i]
         for j in range(d.shape[1]):
-            total += d[row, j] * displacement[j]
-        force[row] = total
+            x += d[row, j] * displacement[j]
+            y += d[row + 1, j] * displacement[j]
+            z += d[row + 2, j] * displacement[j]
+        force[row], force[row + 1], force[row + 2] = x, y, z
 
 
 @compiled
@@ -41,7 +45,7 @@ def update(
         first, second = state[i], state[i + 1]
         state[i] = diagonal[i] * first + cross[i] * second
         state[i + 1] = cross[i + 1] * first + diagonal[i + 1] * second
-    for j in range(b_transposed.shape[0]):
-        u = displacement[j]
+    for j in range(0, b_transposed.shape[0], 3):
+        x, y, z = displacement[j], displacement[j + 1], displacement[j + 2]
         for i in range(state.shape[0]):
-            state[i] += b_transposed[j, i] * u
+            state[i] += b_transposed[j, i] * x + b_transposed[j + 1, i] * y + b_transposed[j + 2, i] * z

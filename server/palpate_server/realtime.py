@@ -9,7 +9,7 @@ import resource
 import sys
 
 PRIORITY = 80  # of SCHED_FIFO, 1 to 99: above ordinary threads, below the kernel's own
-_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # on fault: what is never touched needs no memory
 _SWITCH_INTERVAL_S = 1e-4  # after which a busy Python thread lets another one run
 
 
@@ -31,7 +31,7 @@ def lock_memory() -> str | None:
     if soft != resource.RLIM_INFINITY and os.geteuid() != 0:  # a limited lock makes later allocations fail
         return f"memory is not locked (limit {soft} bytes): allow it with `ulimit -l unlimited`"
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE):
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
         return f"memory is not locked ({os.strerror(ctypes.get_errno())})"
     return None
 
