@@ -132,23 +132,14 @@ def serve(
 ) -> Iterator[Callable[..., ServedModel]]:
     processes: list[subprocess.Popen[str]] = []
 
-    def start(*options: str, n_contacts: int = 1) -> ServedModel:
+    def start(*options: str, n_contacts: int = 1, listen: bool = True) -> ServedModel:
         model = make_spring_mass_model(n_contacts, 20)
         path = tmp_path / f"model{n_contacts}.npz"
         save_model(model, path)
         endpoint = free_endpoint()
+        place = ("--listen", endpoint) if listen else ()
         process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "palpate_server",
-                str(path),
-                "--listen",
-                endpoint,
-                "--session",
-                SESSION,
-                *options,
-            ],
+            [sys.executable, "-m", "palpate_server", str(path), *place, "--session", SESSION, *options],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

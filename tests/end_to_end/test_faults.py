@@ -1,0 +1,189 @@
+"""Clients that misbehave in time: bursts, jumping clocks, reordering, fights. The force stays within its limits in all."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import zenoh
+
+from palpate_server import wire
+from palpate_server.round_trips import free_endpoint
+
+MAX_FORCE_N, MAX_STEP_N = 1.0, 2.0  # of the server below; 2000 N/s
+
+
+def check(messages: list[dict[str, Any]]) -> None:
+    """What holds whatever a client does."""
+    for message in messages:
+        force = message["force_n"][0]
+        assert all(math.isfinite(f) for f in force)
+        assert math.hypot(*force) <= MAX_FORCE_N + 1e-9
+        assert 0 <= message["force_scale"][0] <= 1
+    for before, after in itertools.pairwise(messages):
+        assert after["tick"] > before["tick"]
+        step = math.dist(before["force_n"][0], after["force_n"][0])
+        assert step <= MAX_STEP_N * (after["tick"] - before["tick"]) + 1e-9
+
+
+@pytest.fixture
+def served(serve: Callable[..., Any]) -> Any:
+    return serve("--max-force-n", str(MAX_FORCE_N))
+
+
+def test_bursts_of_commands_make_no_more_ticks_than_time_has(
+    served: Any, connect: Callable[..., Any]
+) -> None:
+    with connect(served.endpoint) as client:
+        assert client.acquire("tip")[0]
+        before, started = client.next_status(), time.monotonic_ns()
+        for burst in range(20):
+            for _ in range(100):
+                client.command({"tip": [0.0, 0.0, 1e-4 * burst]})
+            time.sleep(0.05)
+        after = client.next_status()
+        ticks = after["ticks"] + after["skipped_ticks"] - before["ticks"] - before["skipped_ticks"]
+        elapsed_ns = after["server_time_ns"] - before["server_time_ns"]
+        assert time.monotonic_ns() - started > 1e9
+        assert ticks <= elapsed_ns * 1.002e-6 + 2  # the deadlines follow a client by 0.2 % at most
+        assert ticks >= elapsed_ns * 0.998e-6 - 25  # what is missed now is made up for later
+        assert after["accepted"] - before["accepted"] == 2000
+        check(client.forces)
+
+
+def test_a_clients_clock_that_jumps_changes_nothing_but_the_echo(
+    served: Any, connect: Callable[..., Any]
+) -> None:
+    jumps = (0, 1, 2**62, 5, 2**63 - 1)
+    with connect(served.endpoint) as client:
+        assert client.acquire("tip")[0]
+        for sequence in range(1, 400):
+            message = {
+                "sequence": sequence,
+                "client_time_ns": jumps[sequence % len(jumps)],
+                "displacement_m": {"tip": [0.0, 0.0, 1e-3]},
+            }
+            client.put(wire.pack(message))
+            time.sleep(0.001)
+        status = client.next_status()
+        assert status["accepted"] == 399
+        answered = [m for m in client.forces if m["sequence"][0] > 0]
+        assert all(m["client_time_ns"][0] == jumps[m["sequence"][0] % len(jumps)] for m in answered)
+        check(client.forces)
+
+
+def test_reordered_and_repeated_commands_never_move_the_tip_back(
+    served: Any, connect: Callable[..., Any]
+) -> None:
+    generator = random.Random(0)
+    with connect(served.endpoint) as client:
+        assert client.acquire("tip")[0]
+        order = [max(1, i + generator.randrange(-20, 1)) for i in range(1, 500)]
+        for sequence in order:
+            client.command({"tip": [0.0, 0.0, 1e-5 * sequence]}, sequence=sequence)
+            time.sleep(0.0005)
+        status = client.next_status()
+        newest = list(itertools.accumulate(order, max))
+        accepted = 1 + sum(b > a for a, b in itertools.pairwise(newest))
+        assert status["accepted"] == accepted
+        assert status["refused"]["old_sequence"] == len(order) - accepted
+        sequences = [m["sequence"][0] for m in client.forces if m["sequence"][0] >= 0]
+        assert sequences == sorted(sequences)
+        check(client.forces)
+
+
+def test_of_two_clients_fighting_for_a_contact_one_moves_it(served: Any, connect: Callable[..., Any]) -> None:
+    with connect(served.endpoint) as first, connect(served.endpoint) as second:
+        assert first.acquire("tip")[0]
+        for i in range(200):
+            first.command({"tip": [0.0, 0.0, 1e-3]})
+            second.command({"tip": [0.0, 0.0, -1e-3]}, sequence=1000 + i)
+            if i % 50 == 0:
+                granted, refusal = second.acquire("tip")
+                assert (granted, refusal["reason"]) == (False, "held")
+            time.sleep(0.001)
+        status = first.next_status()
+        assert status["accepted"] == 200
+        assert status["refused"]["not_holder"] == 200
+        moved = [m["displacement_m"][0][2] for m in first.forces]
+        assert min(moved) >= 0
+        check(first.forces)
+
+
+ROUTER = """
+import json, sys, threading, zenoh
+config = zenoh.Config()
+for key, value in json.loads(sys.argv[1]).items():
+    config.insert_json5(key, json.dumps(value))
+with zenoh.open(config):
+    print("ready", flush=True)
+    threading.Event().wait()
+"""
+
+
+def start_router(endpoint: str) -> subprocess.Popen[str]:
+    settings = {"mode": "router", "listen/endpoints": [endpoint], "scouting/multicast/enabled": False}
+    process = subprocess.Popen(
+        [sys.executable, "-c", ROUTER, json.dumps(settings)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def test_a_router_that_is_restarted_fades_the_force_and_lets_the_client_come_back(
+    serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Any
+) -> None:
+    endpoint = free_endpoint()
+    router = start_router(endpoint)
+    try:
+        config = tmp_path / "behind_router.json5"
+        config.write_text(
+            json.dumps(
+                {
+                    "mode": "client",
+                    "connect": {
+                        "endpoints": [endpoint],
+                        "retry": {"period_init_ms": 200, "period_max_ms": 500},
+                    },
+                    "scouting": {"multicast": {"enabled": False}},
+                }
+            )
+        )
+        served = serve("--max-force-n", str(MAX_FORCE_N), "--zenoh-config", str(config), listen=False)
+        with connect(endpoint) as client:
+            assert client.acquire("tip")[0]
+            for _ in range(400):
+                client.command({"tip": [0.0, 0.0, 1e-3]})
+                time.sleep(0.001)
+            assert client.forces[-1]["force_scale"][0] > 0
+            ticks = client.statuses[-1]["ticks"]
+        router.kill()
+        router.communicate()
+        time.sleep(0.5)
+        assert served.process.poll() is None
+        router = start_router(endpoint)
+        give_up = time.monotonic() + 30
+        while True:  # the server has to find its router again
+            try:
+                with connect(endpoint) as client:
+                    assert client.forces[0]["force_scale"] == [0.0]
+                    assert client.statuses[-1]["ticks"] > ticks
+                    assert client.acquire("tip")[0]
+                    client.command({"tip": [0.0, 0.0, 1e-3]})
+                    check(client.forces)
+                    break
+            except (zenoh.ZError, AssertionError):
+                if time.monotonic() > give_up:
+                    raise
+    finally:
+        router.kill()
+        router.communicate()
