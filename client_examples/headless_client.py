@@ -76,12 +76,13 @@ def choose_contact(description, name):
     return contacts[name]
 
 
-def motion(options) -> Callable[[float], float]:
-    """Depth (m, inwards) at a time (s) since the start; both begin at rest."""
+def motion(options) -> Callable[[float], tuple[float, float]]:
+    """Depth (m, inwards) and its speed (m/s) at a time (s) since the start; both motions begin at the rest position."""
     w = 2 * math.pi * options.frequency_hz
     if options.motion == "poke":
-        return lambda t: options.amplitude_m * (1 - math.cos(w * t)) / 2
-    return lambda t: options.amplitude_m * math.sin(w * t)
+        half = options.amplitude_m / 2
+        return lambda t: (half * (1 - math.cos(w * t)), half * w * math.sin(w * t))
+    return lambda t: (options.amplitude_m * math.sin(w * t), options.amplitude_m * w * math.cos(w * t))
 
 
 def drive(connection, contract, contact, depth, options, last_force):
@@ -95,8 +96,12 @@ def drive(connection, contract, contact, depth, options, last_force):
         wait = start + i * period - time.monotonic()
         if wait > 0:
             time.sleep(wait)
-        d = depth(i * period)
-        command = connection.command({contact["name"]: [d * n for n in inwards]})
+        depth_m, speed_m_per_s = depth(i * period)
+        # With the velocity the server carries the motion on when a command is late, instead of holding and jumping.
+        command = connection.command(
+            {contact["name"]: [depth_m * n for n in inwards]},
+            velocity_m_per_s={contact["name"]: [speed_m_per_s * n for n in inwards]},
+        )
         contract.on_sent(command)  # before it is sent: the answer may come before `send` returns
         connection.send(command)
         if connection.gone.is_set():
