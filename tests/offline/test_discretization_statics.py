@@ -30,6 +30,12 @@ def test_statics_without_modes_equal_statics_with_them():
     np.testing.assert_allclose(without, with_modes, atol=1e-9 * np.abs(with_modes).max())
 
 
+def test_a_body_that_nothing_holds_follows_its_tip_without_force():
+    cloud = box_lattice((0, 0, 0), (1, 1, 1), (6, 6, 6), 0.2, seed=3)
+    tip = np.flatnonzero(cloud.points[:, 2] == 1)
+    np.testing.assert_allclose(static_stiffness(cloud, Material(2.0, 0.45, 1.0), [], [tip]), 0, atol=1e-9)
+
+
 POISSONS_RATIO = 0.49
 HALF_WIDTH = 100.0
 # Bonded rigid punch of radius 1 on a half-space, G = 1: 4 ln(3 - 4 nu) / (1 - 2 nu) (Mossakovskii 1954), which is 7.84

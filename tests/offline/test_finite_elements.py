@@ -1,11 +1,16 @@
 """The finite-element referees against exact frequencies; the meshfree models beside them."""
 
+import importlib.util
+import sys
+
 import numpy as np
 import pytest
 from scipy.special import jn_zeros
 
 from palpate.discretization import conservative
+from palpate.discretization.membrane import conservative_modes
 from palpate.experiments import finite_elements
+from palpate.geometry.membranes import disc_membrane, square_membrane
 from palpate.geometry.shapes import box_lattice
 from palpate.material import Material, PronySeries
 from palpate.time_integration import newmark
@@ -17,16 +22,22 @@ CUBE = Material(1.0, 0.3, 10.0, PronySeries((1.0,), (1.0,)))
 CUBE_FREQUENCIES = np.array([0.03365, 0.03365, 0.04571, 0.08037, 0.08894, 0.08894])
 
 
+def _on_circle(x):
+    return np.linalg.norm(x, axis=1) > 1 - 1e-9
+
+
+def _on_square(x):
+    return np.any((x < 1e-9) | (x > 1 - 1e-9), axis=1)
+
+
 def _disc_error(refinements, degree):
     body = finite_elements.disc(refinements, degree)
-    edge = body.at(lambda x: np.linalg.norm(x, axis=1) > 1 - 1e-9)
-    return np.abs(finite_elements.frequencies(body, edge, 6) / DISC - 1).max()
+    return np.abs(finite_elements.frequencies(body, body.at(_on_circle), 6) / DISC - 1).max()
 
 
 def _square_error(intervals, degree):
     body = finite_elements.square(intervals, degree)
-    edge = body.at(lambda x: np.any((x < 1e-9) | (x > 1 - 1e-9), axis=1))
-    return np.abs(finite_elements.frequencies(body, edge, 6) / SQUARE - 1).max()
+    return np.abs(finite_elements.frequencies(body, body.at(_on_square), 6) / SQUARE - 1).max()
 
 
 @pytest.mark.parametrize("degree", [1, 2])
@@ -75,6 +86,28 @@ def test_the_conservative_cube_pushed_by_a_patch_moves_as_finite_elements_do():
     elements = finite_elements.equations_of_motion(body, body.at(lambda x: x[:, 2] < 1e-9), [tip])
     ours, theirs = (newmark(e, CUBE.prony, inputs, 0.1).forces[:, 2] for e in (meshfree, elements))
     assert np.linalg.norm(ours - theirs) < 0.1 * np.linalg.norm(theirs)
+
+
+@pytest.mark.parametrize(
+    ("body", "on_edge", "cloud", "reference"),
+    [
+        (finite_elements.disc(4), _on_circle, disc_membrane, DISC),
+        (finite_elements.square(13), _on_square, square_membrane, SQUARE),
+    ],
+    ids=["disc", "square"],
+)
+def test_the_conservative_membrane_beats_linear_triangles_with_as_many_nodes(body, on_edge, cloud, reference):
+    theirs = np.abs(finite_elements.frequencies(body, body.at(on_edge), 6) / reference - 1).max()
+    modes = conservative_modes(cloud(body.n_dofs))
+    ours = np.abs(np.sqrt(modes.squared_frequencies[:6]) / reference - 1).max()
+    assert ours < theirs / 2
+
+
+def test_without_scikit_fem_the_module_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "skfem", None)
+    specification = importlib.util.spec_from_file_location("without_skfem", finite_elements.__file__)
+    with pytest.raises(ImportError, match=r"needs scikit-fem: pip install 'palpate\[dev\]'"):
+        specification.loader.exec_module(importlib.util.module_from_spec(specification))
 
 
 def test_an_unknown_degree_is_refused():

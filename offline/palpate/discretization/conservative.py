@@ -2,8 +2,8 @@
 
 Stress is collocated at every node, sigma_I = C eps(u^h)(x_I), and the force balance uses the adjoint of the same strain
 operator in the inner product of the nodal volumes V. The strain operator is made to obey the divergence theorem
-(see `consistency`), so that constant stress is in equilibrium. In nodal values u the strain energy is 1/2 sum_I V_I sigma_I : eps_I
-and the mass is rho V, a diagonal. Traction-free surfaces are natural; a held node is a deleted row, and a contact patch
+(see `consistency`), so that constant stress is in equilibrium. In nodal values u the strain energy is
+1/2 sum_I V_I sigma_I : eps_I and the mass is rho V, a diagonal. Traction-free surfaces are natural; a held node is a deleted row, and a contact patch
 is a set of rows and columns added up, whose force is conjugate to the tip's displacement.
 """
 
@@ -27,7 +27,7 @@ from palpate.system import ElasticModes
 from palpate.time_integration import EquationsOfMotion, with_multipliers
 
 SUPPORT_RADIUS_FACTOR = 2.2
-"""Support radius over node spacing: frequencies of lattices and jittered clouds alike are most accurate near it."""
+"""Support radius over node spacing. On the unit cube 1.8 is a little better on lattices and 2.6 worse on scattered nodes."""
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ PENALTY = 100.0
 """Stiffness of the preconditioner's supports over that of a node; it changes the iterations, not the result."""
 
 MAX_ITERATIONS = 2000
-"""Some 100 are usual; a body that nothing holds never converges."""
+"""Some 100 are usual at nu = 0.49, more nearer to 0.5."""
 
 
 def static_stiffness(
@@ -39,7 +39,7 @@ def static_stiffness(
     Conjugate gradients in the nodal values: the stiffness is only ever applied, through the sparse gradient and the
     sparse LU factor of H. The preconditioner is one component's Laplacian, held at the same nodes by a penalty and
     factorised once: elasticity differs from three of them by a factor that the spacing does not enter. Raises as `conservative.elastic_modes`, and RuntimeError when the iteration
-    does not converge because the body is not held.
+    does not converge.
     """
     held = supports(cloud.n_nodes, fixed, contacts)
     h, gradient = sparse_gradient(cloud, support_radius_factor)
@@ -80,8 +80,8 @@ def static_stiffness(
         )
         if failed:
             raise RuntimeError(
-                f"the static solution did not converge in {MAX_ITERATIONS} iterations: expected `fixed` to hold the body "
-                f"(it names {len(held.fixed)} nodes)"
+                f"the static solution did not converge in {MAX_ITERATIONS} iterations: expected poissons_ratio = "
+                f"{material.poissons_ratio} further from 0.5, or a more even cloud"
             )
         u[free] = solution.reshape(-1, 3)
         fields.append(u.ravel())
