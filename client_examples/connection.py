@@ -136,8 +136,8 @@ def _configuration(endpoint, zenoh_config):
         return zenoh.Config.from_file(zenoh_config)
     config = zenoh.Config()
     settings = {
-        "mode": "peer",
-        "listen/endpoints": [],
+        # Everything goes through the one endpoint, be it the server's or a router's; nothing is listened on.
+        "mode": "client",
         "connect/endpoints": [endpoint],
         "connect/timeout_ms": 2000,
         "connect/exit_on_failure": True,

@@ -14,8 +14,6 @@ import zenoh
 from connection import Connection, Refused, ServerGone
 from contract import Contract
 
-SILENCE_S = 0.1  # a device must not be left with an old force for longer
-
 
 class SimulatedDevice:
     """A handle of some mass on a line, held by a hand that is a spring to where the person wants to be."""
@@ -98,8 +96,8 @@ def run(connection, options):
         # Never keep rendering what the server said long ago.
         if connection.gone.is_set():
             trouble = "the server is gone: its liveliness token was taken back"
-        elif time.monotonic() - newest["heard"] > SILENCE_S:
-            trouble = f"the server is silent: no force for {SILENCE_S} s"
+        elif time.monotonic() - newest["heard"] > options.silence_s:
+            trouble = f"the server is silent: no force for {options.silence_s} s"
         if trouble:
             device.render(0.0)
             break
@@ -146,6 +144,12 @@ def parse_options():
     )
     parser.add_argument(
         "--reach-m", type=float, default=0.01, help="how deep the hand wants to go (%(default)s)"
+    )
+    parser.add_argument(
+        "--silence-s",
+        type=float,
+        default=0.1,
+        help="without a force for so long, let go: a device must not be left with an old one (%(default)s s)",
     )
     parser.add_argument("--duration-s", type=float, default=5.0, help="(%(default)s)")
     return parser.parse_args()

@@ -17,8 +17,6 @@ import zenoh
 from connection import Connection, Refused, ServerGone
 from contract import Contract
 
-SILENCE_S = 0.5  # without a force for so long, the server counts as gone
-
 
 def main():
     options = parse_options()
@@ -109,8 +107,8 @@ def drive(connection, contract, contact, depth, options, last_force):
         if last_force.is_set():
             last_force.clear()
             heard = time.monotonic()
-        elif time.monotonic() - heard > SILENCE_S:
-            return f"the server is silent: no force for {SILENCE_S} s"
+        elif time.monotonic() - heard > options.silence_s:
+            return f"the server is silent: no force for {options.silence_s} s"
     return None
 
 
@@ -179,6 +177,9 @@ def parse_options():
     parser.add_argument("--frequency-hz", type=positive, default=1.0, help="pokes a second (%(default)s)")
     parser.add_argument("--duration-s", type=positive, default=5.0, help="how long (%(default)s s)")
     parser.add_argument("--rate-hz", type=positive, default=1000.0, help="commands a second (%(default)s)")
+    parser.add_argument(
+        "--silence-s", type=positive, default=0.5, help="without a force for so long, give up (%(default)s s)"
+    )
     parser.add_argument(
         "--record", metavar="FILE.csv", help="write every tick: applied displacement and force"
     )

@@ -166,8 +166,10 @@ def run_example() -> Iterator[Callable[..., subprocess.Popen[str]]]:
     processes: list[subprocess.Popen[str]] = []
 
     def run(script: str, endpoint: str, *options: str) -> subprocess.Popen[str]:
+        patient = ("--silence-s", "5")  # a busy test machine is no reason to let go
+        place = ("--connect", endpoint, "--session", SESSION)
         process = subprocess.Popen(
-            [sys.executable, str(EXAMPLES / script), "--connect", endpoint, "--session", SESSION, *options],
+            [sys.executable, str(EXAMPLES / script), *place, *patient, *options],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

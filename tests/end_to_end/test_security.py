@@ -90,13 +90,8 @@ def test_without_a_certificate_nothing_is_read_and_nothing_moved(folder: Path, w
     assert done.returncode == 2
     assert "palpate client:" in done.stderr
 
-    config = zenoh.Config.from_file(folder / f"{who}.json5")
-    config.insert_json5("connect/exit_on_failure", "false")
-    heard: list[object] = []
-    with zenoh.open(config) as session:
-        session.declare_subscriber("palpate/**", heard.append)
-        time.sleep(1.0)
-        assert heard == []
+    with pytest.raises(zenoh.ZError):  # there is not even a session in which to listen
+        zenoh.open(zenoh.Config.from_file(folder / f"{who}.json5"))
 
 
 @pytest.mark.usefixtures("server")
