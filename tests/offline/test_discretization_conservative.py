@@ -128,6 +128,17 @@ def test_vector_areas_obey_the_divergence_theorem(cloud):
     assert not np.any(b[~cloud.boundary])
 
 
+def test_the_divergence_theorem_holds_to_local_round_off_where_spacing_spans_a_factor_of_twenty():
+    surface = box_surface((-20, -20, -20), (20, 20, 0))
+    cloud = fill_surface(surface, 5.0, (Refinement((0.0, 0.0, 0.0), 0.5, 0.25, growth=0.5, rings=True),))
+    assert cloud.spacing.max() / cloud.spacing.min() > 15
+    h, gradient = conservative.sparse_gradient(cloud, 2.2)
+    target = h.value.T @ vector_areas(cloud)
+    for axis, g in enumerate(gradient):
+        local = abs(g).T @ cloud.volumes
+        assert np.all(np.abs(g.T @ cloud.volumes - target[:, axis]) < 100 * EPS * local)
+
+
 def test_stiffness_is_symmetric_and_semi_definite_with_six_rigid_motions(cloud):
     k = conservative.stiffness(conservative.gradient(cloud), cloud.volumes, CUBE)
     np.testing.assert_allclose(k, k.T, atol=100 * EPS * np.abs(k).max())

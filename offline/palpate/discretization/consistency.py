@@ -2,8 +2,9 @@
 
 Summing over nodes, sum_I V_I dh_J/dx(x_I) differs from the boundary integral of h_J n. That difference acts as a spurious
 body force under constant stress, and with it frequencies do not converge on scattered nodes. The correction here is
-the smallest (in the norm sum_IJ h_I² dG_IJ² / W_IJ, on the same sparsity) that keeps linear fields exact, row by row, and makes sum_I V_I G_I = b, the nodal vector areas. Because strain and its adjoint use the same corrected operator,
-symmetry stays. The idea is that of variationally consistent integration (Chen, Hillman & Rueter 2013).
+the smallest (in the norm sum_IJ h_I² dG_IJ² / W_IJ, on the same sparsity) that keeps linear fields exact, row by row,
+and makes sum_I V_I G_I = b, the nodal vector areas. Because strain and its adjoint use the same corrected operator,
+symmetry stays. The idea is that of variationally consistent integration (Chen, Hillman & Rüter 2013).
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def consistent_gradient(
     offset = points[other] - points[node]
     weight = quartic_spline(np.minimum(np.linalg.norm(offset, axis=1) / radii[other], 1.0))
     linear = np.column_stack([np.ones(len(offset)), offset / spacing[node, None]])  # (nnz, terms)
-    # With multipliers xi the correction is W (xi - its local linear fit) / h², whose constraint is S xi = defect.
+    # With multipliers xi the correction is W (xi - its local linear fit) V / h², whose constraint is S xi = defect.
     moments = np.stack(
         [[np.bincount(node, weight * p * q, minlength=n) for q in linear.T] for p in linear.T], axis=0
     ).transpose(2, 0, 1)
@@ -57,16 +58,20 @@ def consistent_gradient(
     )
     diagonal = np.bincount(other, weight * scale[node], minlength=n)
     normal = (diags_array(diagonal) - fit.T @ (inner @ fit)).toarray(order="F")
+    # Scaled to a unit diagonal, which on graded clouds spans many powers of ten.
+    root = np.sqrt(diagonal)
+    normal /= root[:, None]
+    normal /= root
     # Linear fields need no correction: they are the null space, and no defect has a part along them.
-    null = np.column_stack([np.ones(n), points - points.mean(axis=0)])
-    null /= np.linalg.norm(null, axis=0)
-    normal += np.mean(diagonal) * null @ null.T
+    null, _ = np.linalg.qr(root[:, None] * np.column_stack([np.ones(n), points - points.mean(axis=0)]))
+    normal += null @ null.T
     factor = cho_factor(normal, overwrite_a=True, check_finite=False)
 
     target = h.value.T @ boundary
     corrected = []
     for axis, plain in enumerate(h.gradient):
-        xi = cho_solve(factor, target[:, axis] - plain.T @ volumes, check_finite=False)
+        defect = target[:, axis] - plain.T @ volumes
+        xi = cho_solve(factor, defect / root, check_finite=False) / root
         fitted = (inverse_moments @ (fit @ xi).reshape(n, terms, 1))[:, :, 0]
         change = weight * share[node] * (xi[other] - np.sum(linear * fitted[node], axis=1))
         corrected.append(csr_array((plain.data + change, plain.indices, plain.indptr), shape=plain.shape))

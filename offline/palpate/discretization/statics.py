@@ -38,8 +38,8 @@ def static_stiffness(
 
     Conjugate gradients in the nodal values: the stiffness is only ever applied, through the sparse gradient and the
     sparse LU factor of H. The preconditioner is one component's Laplacian, held at the same nodes by a penalty and
-    factorised once: elasticity differs from three of them by a factor that the spacing does not enter. Raises as `conservative.elastic_modes`, and RuntimeError when the iteration
-    does not converge.
+    factorised once: elasticity differs from three of them by a factor that the spacing does not enter. Raises as
+    `conservative.elastic_modes`, and RuntimeError when the iteration does not converge.
     """
     held = supports(cloud.n_nodes, fixed, contacts)
     h, gradient = sparse_gradient(cloud, support_radius_factor)
