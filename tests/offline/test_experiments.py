@@ -184,7 +184,7 @@ def test_every_method_has_a_reduced_model_of_the_cube(study: Study) -> None:
 def test_the_product_is_per_cent_times_seconds(study: Study) -> None:
     reduced = study.reduced(study.square, MT, 12)
     assert reduced is not None
-    comparison = Comparison(reduced, 0.5, 0.5, 0.5, 0.0, 0.02, 3.0)
+    comparison = Comparison(reduced, 0.5, 0.5, 0.5, 0.0, 0.02, 3.0, None)
     assert comparison.product == pytest.approx(6.0)
 
 

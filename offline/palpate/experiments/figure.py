@@ -52,7 +52,7 @@ class Figure:
 
         canvas = plt.figure(figsize=self.size, layout="constrained")
         self.draw(canvas)
-        canvas.savefig(folder / f"{self.stem}.png", dpi=100)
+        canvas.savefig(folder / f"{self.stem}.png", dpi=95)
         plt.close(canvas)
 
 

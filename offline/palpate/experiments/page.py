@@ -57,9 +57,9 @@ This page is written by `palpate reproduce --out docs`, numbers included; every 
   studied with the same input spread over a smooth spot; the reductions use the single node as the paper does.
 - **Discretisation.** Figures 4 to 14 use our `conservative` discretisation, which is symmetric, stable and passive; figure 15 has the
   paper's collocation beside it.
-- **Solution time.** Reduced models run as real 2 x 2 blocks in one compiled loop, 1 ms a step; the median of five runs. The full model
-  runs in the same loop with all its modes, and by Newmark's method with one sparse factorisation (SuperLU through SciPy, some
-  tens of µs of interpreter a step). All on the machine that wrote this page, beside other work: trust ratios, not digits.
+- **Solution time.** Reduced models run as real 2 x 2 blocks in one compiled loop, 1 ms a step; processor time, the median of five
+  runs. The full model runs in the same loop with all its modes, and by Newmark's method with one sparse factorisation (SuperLU
+  through SciPy, some tens of µs of interpreter a step). Reductions are timed once by the wall clock, beside other work.
 """
 
 

@@ -54,7 +54,7 @@ def reaction_force(study: Study) -> Figure:
         low, high = full.exact.min(), full.exact.max()
         left.set_ylim(low - 0.5 * (high - low), high + 0.9 * (high - low))
         left.legend(frameon=False, fontsize="small", ncols=2)
-        right.set(xlabel="time, s", title="error over the largest force")
+        right.set(xlabel="time, s", title="error over the largest force", ylim=(1e-9, 10))
         tidy(left)
         tidy(right)
 

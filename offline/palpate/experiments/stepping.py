@@ -36,13 +36,16 @@ def step_through(model: StateSpace, inputs: Array) -> Array:
 
 
 def median_seconds(run: Callable[[], object], repeats: int = 5) -> float:
-    """Median wall time of a few runs, s, after one that is not counted (compilation, caches)."""
+    """Median processor time of a few runs of one thread, s, after one that is not counted (compilation, caches).
+
+    Processor time, because wall time on a busy machine measures its neighbours.
+    """
     run()
     times = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = time.thread_time()
         run()
-        times.append(time.perf_counter() - start)
+        times.append(time.thread_time() - start)
     return median(times)
 
 

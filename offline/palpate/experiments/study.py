@@ -14,7 +14,12 @@ from palpate.experiments.full_solution import FullSolution, solve_in_full
 from palpate.experiments.methods import OF_THE_PAPER, Method, Reduced, reduce_by
 from palpate.experiments.stepping import median_seconds, sampled, step_through
 from palpate.reduction.evidence import hinf_error, in_band_error
-from palpate.reduction.frequencies import band_frequencies, relative_errors
+from palpate.reduction.frequencies import (
+    all_frequencies,
+    band_frequencies,
+    relative_errors,
+    spectral_norms,
+)
 
 
 @dataclass(frozen=True)
@@ -26,8 +31,8 @@ class Comparison:
     error_static    the same at 0 Hz
     error_infinite  the same at infinite frequency: what the method does to D
     error_time      sum |F - F_r| over sum |F|, over the samples of the example's history
-    reduction_s     seconds from the full model's modes to the reduced model
-    stepping_s      seconds of the whole history, one compiled step a sample
+    stepping_s      processor time of the whole history, s, one compiled step a sample
+    bound           the method's bound on error_hinf; None without
     """
 
     reduced: Reduced
@@ -37,6 +42,7 @@ class Comparison:
     error_infinite: float
     error_time: float
     stepping_s: float
+    bound: float | None
 
     @property
     def method(self) -> Method:
@@ -118,6 +124,7 @@ class Study:
         model = sampled(small, PERIOD_S)
         exact = self.solution(example).exact
         stepped = step_through(model, example.inputs)[:, example.channel]
+        largest = np.max(spectral_norms(full.transfer(1j * all_frequencies((full,)))))
         return Comparison(
             reduced,
             hinf_error(full, small),
@@ -126,6 +133,7 @@ class Study:
             float(np.linalg.norm(full.d - small.d, 2) / np.linalg.norm(full.d, 2)),
             float(np.sum(np.abs(stepped - exact)) / np.sum(np.abs(exact))),
             median_seconds(lambda: step_through(model, example.inputs)),
+            None if reduced.bound is None else float(reduced.bound / largest),
         )
 
 
