@@ -12,8 +12,16 @@ import pytest
 from scipy.integrate import dblquad, solve_ivp
 
 from palpate.discretization import membrane
-from palpate.experiments import convergence, spot_load
-from palpate.experiments.examples import PERIOD_S, SQUARE_PRONY, centre_of, pulse, square, with_drag
+from palpate.experiments import convergence, finite_elements, spot_load
+from palpate.experiments.examples import (
+    CUBE_MATERIAL,
+    PERIOD_S,
+    SQUARE_PRONY,
+    centre_of,
+    pulse,
+    square,
+    with_drag,
+)
 from palpate.experiments.methods import ALL, HOM, MT, OF_THE_PAPER, TBR
 from palpate.experiments.stepping import sampled, step_through
 from palpate.experiments.study import Comparison, Study, ranking
@@ -147,6 +155,31 @@ def test_deflections_converge_at_second_order_but_for_linear_collocation() -> No
     )
     assert order("collocation, linear", scattered) < 0.5
     assert order("conservative", scattered) > 0.8
+
+
+def test_the_cubes_displacement_comes_nearer_to_quadratic_hexahedra_with_more_nodes() -> None:
+    errors = convergence.cube_errors((4, 7), 6)
+    for method in ("conservative", "linear finite elements"):
+        coarse, fine = (e.value for e in errors if e.method == method)
+        assert fine < 0.7 * coarse  # first order would halve it; measured 0.47 and 0.62
+        assert fine < 0.1
+
+
+def test_a_quarter_of_the_cube_has_a_quarter_of_its_mass() -> None:
+    body = finite_elements.quarter_cube(2, CUBE_MATERIAL)
+    along_z = (body.components == 2).astype(float)
+    assert along_z @ body.mass @ along_z == pytest.approx(CUBE_MATERIAL.density_kg_per_m3 / 4)
+    assert body.places.min(axis=0) == pytest.approx([0.5, 0.5, 0.0])
+
+
+def test_hankel_optimal_reduction_errs_at_infinite_frequency_by_the_first_value_left_out(
+    study: Study,
+) -> None:
+    full = study.square.system
+    reduced = study.reduced(study.square, HOM, 8)
+    assert reduced is not None
+    error = np.linalg.norm(full.d - reduced.system.d, 2)
+    assert error == pytest.approx(reduced.hankel_singular_values[reduced.order], rel=1e-6)
 
 
 def test_the_observed_order_of_a_power_law_is_its_exponent() -> None:

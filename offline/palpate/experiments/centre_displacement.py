@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.discretization import membrane
-from palpate.experiments import linear_elements, spot_load
+from palpate.experiments import finite_element_fields, spot_load
 from palpate.experiments.convergence import DISC_SPOT
 from palpate.experiments.examples import centre_of
 from palpate.experiments.figure import Figure, tidy
@@ -25,10 +25,10 @@ def centre_displacement(study: Study) -> Figure:
     """The paper's history as a force on a smooth spot, 3 s."""
     cloud = disc_membrane(150 if study.quick else _NODES)
     mesh = disc_membrane(_ELEMENT_NODES)
-    triangles = linear_elements.n_triangles(mesh.points)
+    triangles = finite_element_fields.n_triangles(mesh.points)
     times = _STEP_S * np.arange(round(_DURATION_S / _STEP_S) + 1)
     origin = np.zeros((1, 2))
-    elements = linear_elements.membrane_modes(mesh.points, mesh.on_edge, origin[0], DISC_SPOT)
+    elements = finite_element_fields.membrane_modes(mesh.points, mesh.on_edge, origin[0], DISC_SPOT)
     pressure = spot_load.spot(np.linalg.norm(cloud.points, axis=1), DISC_SPOT)
     curves = {
         "exact": _at(0, *spot_load.disc_modes(origin, DISC_SPOT), len(times)),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.discretization import collocation, conservative, membrane
-from palpate.experiments import linear_elements, spot_load
+from palpate.experiments import finite_element_fields, spot_load
 from palpate.experiments.examples import CUBE_MATERIAL, CUBE_SINE_HZ, SQUARE_PRONY
 from palpate.experiments.figure import Figure, tidy
 from palpate.experiments.study import Study
@@ -122,7 +122,7 @@ def membrane_errors(
         for method, modes in _meshfree(cloud):
             load = spot_load.modal_load(modes.shapes, pressure)
             add(method, deflection(modes.squared_frequencies, modes.shapes, load, prony))
-        elements = linear_elements.membrane_modes(cloud.points, cloud.on_edge, middle, spot_radius)
+        elements = finite_element_fields.membrane_modes(cloud.points, cloud.on_edge, middle, spot_radius)
         add("linear finite elements", deflection(*elements, prony))
     return errors
 
@@ -141,7 +141,7 @@ def cube_errors(counts: Sequence[int], reference_elements: int) -> list[Error]:
     omegas = [2 * np.pi * f for f in CUBE_FREQUENCIES_HZ]
     endings = ["", *(f", {f:g} Hz" for f in CUBE_FREQUENCIES_HZ[1:])]
     references = [
-        linear_elements.QuadraticCube(reference_elements, CUBE_MATERIAL, omega, _pressed_top)
+        finite_element_fields.QuadraticCube(reference_elements, CUBE_MATERIAL, omega, _pressed_top)
         for omega in omegas
     ]
     errors = []
@@ -167,9 +167,9 @@ def cube_errors(counts: Sequence[int], reference_elements: int) -> list[Error]:
             for i, omega in enumerate(omegas):
                 add(method, i, harmonic_field(modes, omega, motion.ravel()).reshape(-1, 3))
         for i, omega in enumerate(omegas):
-            points, field = linear_elements.cube_of_tetrahedra(n, CUBE_MATERIAL, omega, _pressed_top)
+            _, field = finite_element_fields.cube_of_tetrahedra(n, CUBE_MATERIAL, omega, _pressed_top)
             ordered = np.empty_like(field)
-            ordered[_lexicographic(cloud.points)] = field[_lexicographic(points)]
+            ordered[_lexicographic(cloud.points)] = field
             add("linear finite elements", i, ordered)
     return errors
 

@@ -75,9 +75,16 @@ def cube(intervals: int, material: Material, degree: int = 1) -> FiniteElements:
     axis = np.linspace(0, 1, intervals + 1)
     mesh = skfem.MeshTet.init_tensor(axis, axis, axis)
     element = skfem.ElementTetP1() if _degree(degree) == 1 else skfem.ElementTetP2()
-    basis = skfem.Basis(mesh, skfem.ElementVector(element), intorder=2 * degree)
-    stiffness = linear_elasticity(material.lame_lambda_pa, material.shear_modulus_pa)
-    return _assembled(basis, stiffness, material.density_kg_per_m3, 3)
+    return _solid(skfem.Basis(mesh, skfem.ElementVector(element), intorder=2 * degree), material)
+
+
+def quarter_cube(intervals: int, material: Material) -> FiniteElements:
+    """The quarter x, y >= 1/2 of the unit cube: quadratic hexahedra, an even number `intervals` to an edge of the whole."""
+    if intervals % 2:
+        raise ValueError(f"intervals = {intervals}: expected an even number")
+    half, whole = np.linspace(0.5, 1, intervals // 2 + 1), np.linspace(0, 1, intervals + 1)
+    mesh = skfem.MeshHex.init_tensor(half, half, whole)
+    return _solid(skfem.Basis(mesh, skfem.ElementVector(skfem.ElementHex2()), intorder=4), material)
 
 
 def frequencies(body: FiniteElements, fixed: ArrayLike, count: int) -> Array:
@@ -127,6 +134,11 @@ def _membrane(mesh: Any, degree: int) -> FiniteElements:
     element = skfem.ElementTriP1() if _degree(degree) == 1 else skfem.ElementTriP2()
     basis = skfem.Basis(mesh, element, intorder=2 * degree + 2)
     return _assembled(basis, skfem.BilinearForm(lambda u, v, _: dot(grad(u), grad(v))), 1.0, 1)
+
+
+def _solid(basis: Any, material: Material) -> FiniteElements:
+    stiffness = linear_elasticity(material.lame_lambda_pa, material.shear_modulus_pa)
+    return _assembled(basis, stiffness, material.density_kg_per_m3, 3)
 
 
 def _assembled(basis: Any, stiffness: Any, density: float, n_components: int) -> FiniteElements:

@@ -1,9 +1,10 @@
-"""Linear finite elements, as the paper sets beside its method, and a quadratic reference. Needs scikit-fem."""
+"""Deflections and displacements of the convergence studies by finite elements, the reference included. Needs scikit-fem."""
 
 from __future__ import annotations
 
 import importlib.util
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,13 @@ from scipy.spatial import Delaunay
 from palpate.experiments.spot_load import spot
 from palpate.material import Material
 
+if TYPE_CHECKING:
+    from palpate.experiments.finite_elements import FiniteElements
+
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Profile = Callable[[Array, Array], Array]
+"""A displacement over the top, by x and y."""
 
 
 def require_scikit_fem() -> None:
@@ -63,40 +70,33 @@ def n_triangles(points: Array) -> int:
 
 
 def cube_of_tetrahedra(
-    nodes_an_edge: int, material: Material, omega: float, top: Any
-) -> tuple[Array, NDArray[np.complex128]]:
+    nodes_an_edge: int, material: Material, omega: float, top: Profile
+) -> tuple[Array, Complex]:
     """(points (n, 3), displacement (n, 3)) of linear tetrahedra under u_z = top(x, y) e^{j omega t} on z = 1, held at z = 0."""
     require_scikit_fem()
-    from skfem import ElementTetP1, MeshTet
+    from palpate.experiments import finite_elements
 
-    axis = np.linspace(0, 1, nodes_an_edge)
-    mesh = MeshTet.init_tensor(axis, axis, axis)
-    locations, values = _harmonic(mesh, ElementTetP1(), material, omega, top, ())
-    return locations, values
+    body = finite_elements.cube(nodes_an_edge - 1, material)
+    return _harmonic(body, material, omega, top, ())
 
 
 class QuadraticCube:
     """The same by quadratic hexahedra on a quarter of the cube, with its two planes of symmetry: the reference.
 
-    top must be even in x and y about 0.5.
+    top must be even in x and y about 0.5, elements_an_edge (of the whole cube) even.
     """
 
-    def __init__(self, elements_an_edge: int, material: Material, omega: float, top: Any) -> None:
+    def __init__(self, elements_an_edge: int, material: Material, omega: float, top: Profile) -> None:
         require_scikit_fem()
-        from skfem import ElementHex2, MeshHex
+        from palpate.experiments import finite_elements
 
-        if elements_an_edge % 2:
-            raise ValueError(f"elements_an_edge = {elements_an_edge}: expected an even number")
-        half = np.linspace(0.5, 1, elements_an_edge // 2 + 1)
-        whole = np.linspace(0, 1, elements_an_edge + 1)
-        mesh = MeshHex.init_tensor(half, half, whole)
-        locations, values = _harmonic(mesh, ElementHex2(), material, omega, top, (0, 1))
-        order = np.lexsort(np.round(locations, 9).T[::-1])
+        body = finite_elements.quarter_cube(elements_an_edge, material)
+        locations, values = _harmonic(body, material, omega, top, (0, 1))
         axes = tuple(np.unique(np.round(locations[:, i], 9)) for i in range(3))
-        grid = values[order].reshape(*(len(a) for a in axes), 3)
+        grid = values.reshape(*(len(a) for a in axes), 3)
         self._field = RegularGridInterpolator(axes, grid, method="cubic")
 
-    def __call__(self, points: Array) -> NDArray[np.complex128]:
+    def __call__(self, points: Array) -> Complex:
         """(n, 3), complex displacement at the points (n, 3), cubic between the nodes."""
         away = points - 0.5
         folded = points.copy()
@@ -107,37 +107,21 @@ class QuadraticCube:
 
 
 def _harmonic(
-    mesh: Any, element: Any, material: Material, omega: float, top: Any, symmetric: tuple[int, ...]
-) -> tuple[Array, NDArray[np.complex128]]:
-    """(locations, displacements) of the nodes; `symmetric` axes have a plane of symmetry at 0.5."""
-    from skfem import Basis, BilinearForm, ElementVector
-    from skfem.helpers import dot
-    from skfem.models.elasticity import linear_elasticity
-
-    basis = Basis(mesh, ElementVector(element))
-    lam, mu = material.lame_lambda_pa, material.shear_modulus_pa
-    stiffness = linear_elasticity(lam, mu).assemble(basis)
-    mass = BilinearForm(lambda u, v, w: material.density_kg_per_m3 * dot(u, v)).assemble(basis)
+    body: FiniteElements, material: Material, omega: float, top: Profile, symmetric: tuple[int, ...]
+) -> tuple[Array, Complex]:
+    """(places, displacements), (n, 3) each, the nodes by x, then y, then z; `symmetric` axes have a plane of symmetry at 0.5."""
     memory = complex(material.prony.transfer_factor(np.array([1j * omega]))[0])
-    system = csc_array(memory * stiffness - omega**2 * mass)
-    x, y, z = basis.doflocs
-    component = np.zeros(basis.N, dtype=int)
-    node_dofs = _components(basis)
-    for i, dofs in enumerate(node_dofs):
-        component[dofs] = i
+    system = csc_array(memory * body.stiffness - omega**2 * body.mass)
+    places = np.round(body.places, 9)
+    x, y, z = places.T
     known = (z == 0) | (z == 1)
     for axis in symmetric:
-        known |= (component == axis) & (basis.doflocs[axis] == 0.5)
-    u = np.zeros(basis.N, dtype=np.complex128)
-    driven = (z == 1) & (component == 2)
+        known |= (body.components == axis) & (places[:, axis] == 0.5)
+    u = np.zeros(body.n_dofs, dtype=np.complex128)
+    driven = (z == 1) & (body.components == 2)
     u[driven] = top(x[driven], y[driven])
     free = np.flatnonzero(~known)
     right = -(system[:, known] @ u[known])[free]
     u[free] = splu(system[free][:, free], permc_spec="MMD_AT_PLUS_A").solve(right)
-    return basis.doflocs[:, node_dofs[0]].T, np.column_stack([u[dofs] for dofs in node_dofs])
-
-
-def _components(basis: Any) -> list[NDArray[np.intp]]:
-    """The unknowns of x, y and z, the nodes in the same order in each."""
-    parts = [basis.nodal_dofs, basis.edge_dofs, basis.facet_dofs, basis.interior_dofs]
-    return [np.concatenate([p[i::3].ravel() for p in parts if p is not None and p.size]) for i in range(3)]
+    by_place = np.lexsort((body.components, z, y, x)).reshape(-1, 3)
+    return places[by_place[:, 0]], u[by_place]
