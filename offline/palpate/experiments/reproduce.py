@@ -6,7 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from palpate.experiments import beyond, convergence, reductions
+from palpate.experiments import (
+    convergence,
+    discretisations,
+    errors_and_times,
+    frequency_responses,
+    orders,
+)
 from palpate.experiments.centre_displacement import centre_displacement
 from palpate.experiments.figure import Figure
 from palpate.experiments.page import write_page
@@ -17,19 +23,19 @@ from palpate.plots import require_matplotlib
 FIGURES: dict[int, Callable[[Study], Figure]] = {
     2: centre_displacement,
     3: convergence.disc,
-    4: lambda study: reductions.frequency_response(study, study.disc, 4),
-    5: lambda study: reductions.error_and_time(study, study.disc, 5),
+    4: lambda study: frequency_responses.frequency_response(study, study.disc, 4),
+    5: lambda study: errors_and_times.error_and_time(study, study.disc, 5),
     6: convergence.square,
-    7: lambda study: reductions.frequency_response(study, study.square, 7),
-    8: lambda study: reductions.error_and_time(study, study.square, 8),
+    7: lambda study: frequency_responses.frequency_response(study, study.square, 7),
+    8: lambda study: errors_and_times.error_and_time(study, study.square, 8),
     9: convergence.cube,
-    10: lambda study: reductions.frequency_response(study, study.cube, 10),
+    10: lambda study: frequency_responses.frequency_response(study, study.cube, 10),
     11: reaction_force,
-    12: lambda study: reductions.error_and_time(study, study.cube, 12),
-    13: reductions.products,
-    14: beyond.error_against_order,
-    15: beyond.both_discretisations,
-    16: beyond.passivity,
+    12: lambda study: errors_and_times.error_and_time(study, study.cube, 12),
+    13: errors_and_times.products,
+    14: orders.error_against_order,
+    15: discretisations.both_discretisations,
+    16: orders.passivity,
 }
 """Those of the paper by its numbers (figure 1 is a sketch), then ours."""
 
