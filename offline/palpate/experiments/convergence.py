@@ -246,6 +246,9 @@ def _figure(number: int, title: str, errors: list[Error], dimensions: int, findi
         draw,
         findings + "\n\n" + _order_table(by_method, orders),
         (9.0, 4.2),
+        f"{title.split(':')[0]}, observed orders of convergence: "
+        + "; ".join(f"{m} {o:.1f}" for m, o in orders.items())
+        + ".",
     )
 
 

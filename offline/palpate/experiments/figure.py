@@ -24,6 +24,7 @@ class Figure:
     draw      draws onto an empty matplotlib figure
     findings  what we find and why it differs from the paper, Markdown, computed from the rows
     size      of the plot, inches
+    headline  what to remember of it, one line of Markdown, for the page's summary; empty for none
     """
 
     number: int
@@ -33,6 +34,7 @@ class Figure:
     draw: Callable[[Any], None]
     findings: str
     size: tuple[float, float] = (9.0, 4.0)
+    headline: str = ""
 
     @property
     def stem(self) -> str:

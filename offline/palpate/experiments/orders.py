@@ -113,6 +113,9 @@ def error_against_order(study: Study) -> Figure:
         draw,
         _smallest_orders(measured, examples),
         (11.0, 9.0),
+        "Fewest states for 2 %: "
+        + "; ".join(f"{e.name} {_fewest_states(measured, e)}" for e in examples)
+        + ".",
     )
 
 
@@ -149,6 +152,7 @@ def passivity(study: Study) -> Figure:
         "sampled by the trapezoidal rule at 1 kHz; at 0 or above (1e-12 is round-off) no closed poke gets energy out.",
         "",
     ]
+    always = {m.name for m in ALL}
     for example in examples:
         passive = [
             m.name
@@ -156,6 +160,7 @@ def passivity(study: Study) -> Figure:
             if (own := [p for p in measured if p.example == example.name and p.method is m])
             and min(p.margin for p in own) > -1e-9
         ]
+        always &= set(passive)
         worst = min((p for p in measured if p.example == example.name), key=lambda p: p.margin)
         lines.append(
             f"- {example.name}: full model {full[example.name]:.1e}; passive at every order: {', '.join(passive) or 'none'}; "
@@ -169,6 +174,7 @@ def passivity(study: Study) -> Figure:
         draw,
         "\n".join(lines),
         (11.0, 4.2),
+        f"Passive once sampled, at every order and in all three problems: {', '.join(m.name for m in ALL if m.name in always) or 'none'}.",
     )
 
 
@@ -191,7 +197,7 @@ def _smallest_orders(measured: Sequence[Point], examples: Sequence[Example]) -> 
             cells.append(" / ".join(_from(own, f) for f in ("error_hinf", "error_band", "error_static")))
         lines.append(f"| {method.label} | " + " | ".join(cells) + " |")
     lines.append("")
-    lines += [_fewest_states(measured, example) for example in examples]
+    lines += [f"- Fewest states, {e.name}: {_fewest_states(measured, e)}." for e in examples]
     nearly_lossless = [p for p in measured if p.example == "disc" and p.method is BAND]
     if nearly_lossless and nearly_lossless[-1].error_band > _GOOD_ENOUGH:
         lines.append(
@@ -224,7 +230,7 @@ def _fewest_states(measured: Sequence[Point], example: Example) -> str:
             parts.append(f"{where} {best} ({orders[best]})")
         else:
             parts.append(f"{where} none")
-    return f"- Fewest states, {example.name}: {', '.join(parts)}."
+    return ", ".join(parts)
 
 
 def _from(own: Sequence[Point], field: str) -> str:
