@@ -15,6 +15,7 @@ from palpate.config import (
     BoxGeometry,
     BoxRegion,
     Config,
+    ContactTable,
     NearestRegion,
     PlaneRegion,
     SphereRegion,
@@ -45,6 +46,9 @@ from palpate.system import ElasticModes
 from palpate.viscoelastic import viscoelastic_system
 
 Array = NDArray[np.float64]
+
+_NEAR_SURFACE = 0.1
+"""How far from the surface a contact's point may be, as a fraction of the body's diagonal: it is moved onto it."""
 
 _UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _VIEW_EDGE = 1.5
@@ -99,7 +103,7 @@ def build_model(config: Config, folder: Path, report: Report) -> ReducedModel:
     )
     continuous = reduction.state_space
     discrete = discretise(continuous, period_s, rule, band_hz[1])
-    report.note(f"{full.system.n_states:,} → {reduction.order} states")
+    report.note(f"{full.system.n_states:,} → {continuous.order} states")
 
     report("surface")
     vertices_surface = _view_surface(full.cloud, config)
@@ -151,8 +155,9 @@ def build_full_model(config: Config, folder: Path, report: Report) -> FullModel:
 
     report("node cloud")
     cloud = build_cloud(config, folder)
-    contacts = tuple(contact_patch(t.point_m, t.radius_m, cloud) for t in config.contact)
-    held = np.unique(np.concatenate([nodes_in(_region(r), cloud) for r in config.fixed]))
+    contacts = tuple(_contact_patch(t, cloud) for t in config.contact)
+    held = np.unique(np.concatenate([_fixed_nodes(i, r, cloud) for i, r in enumerate(config.fixed)]))
+    _refuse_shared_nodes(config, contacts, held)
     report.note(
         f"{cloud.n_nodes:,} nodes, {int(cloud.boundary.sum()):,} on the surface, {len(held)} fixed, "
         f"{' + '.join(str(len(c.nodes)) for c in contacts)} in contact"
@@ -205,6 +210,51 @@ def _region(table: BoxRegion | PlaneRegion | SphereRegion | NearestRegion) -> re
             return regions.NearestRegion(point)
 
 
+def _fixed_nodes(
+    index: int, table: BoxRegion | PlaneRegion | SphereRegion | NearestRegion, cloud: NodeCloud
+) -> NDArray[np.intp]:
+    try:
+        return nodes_in(_region(table), cloud)
+    except ValueError as error:
+        raise ValueError(f"fixed[{index}]: {error}") from error
+
+
+def _contact_patch(table: ContactTable, cloud: NodeCloud) -> ContactPatch:
+    """The patch of a contact. Raises ValueError where it is off the surface or larger than the body's side."""
+    try:
+        patch = contact_patch(table.point_m, table.radius_m, cloud)
+    except ValueError as error:
+        raise ValueError(f"contact {table.name!r}: {error}") from error
+    away = float(np.linalg.norm(patch.center_m - np.asarray(table.point_m)))
+    reach = max(table.radius_m, float(np.max(cloud.spacing)))
+    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+    if away > max(reach, _NEAR_SURFACE * float(np.linalg.norm(high - low))):
+        raise ValueError(
+            f"contact {table.name!r}: point_m = {list(table.point_m)} is {away:.3g} m from the surface: expected a point "
+            f"near it (the body reaches from {low.round(4).tolist()} to {high.round(4).tolist()})"
+        )
+    # A disc of radius a on a flat face; a patch that wraps around the body has far less of it than pi a².
+    area = float(np.sum(cloud.areas[patch.nodes]))
+    if area < 0.25 * np.pi * table.radius_m**2 and len(patch.nodes) > 1:
+        raise ValueError(
+            f"contact {table.name!r}: radius_m = {table.radius_m:g} holds {area:.3g} m² of the surface, a disc of that "
+            f"radius {np.pi * table.radius_m**2:.3g} m²: expected a patch that the body has room for"
+        )
+    return patch
+
+
+def _refuse_shared_nodes(config: Config, contacts: tuple[ContactPatch, ...], fixed: NDArray[np.intp]) -> None:
+    owner = {int(n): "fixed" for n in fixed}
+    for table, patch in zip(config.contact, contacts, strict=True):
+        for node in patch.nodes.tolist():
+            if node in owner:
+                with_whom = "a fixed region" if owner[node] == "fixed" else f"contact {owner[node]!r}"
+                raise ValueError(
+                    f"contact {table.name!r} and {with_whom} share node {node}: expected them apart from each other"
+                )
+            owner[node] = table.name
+
+
 def _elastic_modes(
     config: Config,
     cloud: NodeCloud,
@@ -213,15 +263,6 @@ def _elastic_modes(
     contacts: tuple[ContactPatch, ...],
 ) -> ElasticModes:
     discretization = conservative if config.discretization.method == "conservative" else collocation
-    clash = [
-        (t.name, p) for t, p in zip(config.contact, contacts, strict=True) if np.isin(p.nodes, fixed).any()
-    ]
-    if clash:
-        name, patch = clash[0]
-        raise ValueError(
-            f"contact {name!r} holds {int(np.isin(patch.nodes, fixed).sum())} nodes that are fixed: "
-            "expected a contact patch away from the fixed regions"
-        )
     return discretization.elastic_modes(
         cloud,
         material,

@@ -36,11 +36,11 @@ def main() -> None:
     """Entry point: mistakes of the user end in one line and exit code 2."""
     try:
         app()
-    except (ValueError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
+    except (ValueError, OSError, MemoryError) as error:
         if os.environ.get("PALPATE_TRACEBACK"):
             raise
         errors.print("error:", style="bold red", end=" ")
-        errors.print(str(error), markup=False, highlight=False, soft_wrap=True)
+        errors.print(str(error) or "out of memory", markup=False, highlight=False, soft_wrap=True)
         sys.exit(2)
 
 
@@ -60,15 +60,15 @@ def _options(
 
 
 def parse_tolerance(text: str) -> float:
-    """A relative error as `0.02` or `2%`. Raises typer.BadParameter."""
+    """A relative error as `0.02` or `2%`. Raises ValueError."""
     try:
         value = float(text.removesuffix("%")) * (0.01 if text.endswith("%") else 1.0)
     except ValueError:
-        raise typer.BadParameter(
-            f"{text!r}: expected a fraction such as 0.02, or a percentage such as 2%"
+        raise ValueError(
+            f"--tolerance {text!r}: expected a fraction such as 0.02, or a percentage such as 2%"
         ) from None
     if not 0 < value < 1:
-        raise typer.BadParameter(f"{text!r}: expected above 0 and below 1 (100%)")
+        raise ValueError(f"--tolerance {text!r}: expected above 0 and below 1 (100%)")
     return value
 
 
@@ -89,17 +89,16 @@ def build(
 ) -> None:
     """Build a scene into a model file and print the evidence of its accuracy."""
     from palpate.config import load_config, override_reduction
-    from palpate.model import save_model
+    from palpate.model import check_writable, save_model
 
     if order is not None and tolerance is not None:
-        raise typer.BadParameter("--order and --tolerance exclude each other")
+        raise ValueError("--order and --tolerance exclude each other: expected at most one of them")
     scene = load_config(config)
     if method is not None or order is not None or tolerance is not None:
         wanted = None if tolerance is None else parse_tolerance(tolerance)
         scene = override_reduction(scene, method, order, wanted, "command line")
     path = output or Path(f"{scene.name}.npz")
-    if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: expected the name of a model file")
+    check_writable(path)
     start = time.monotonic()
     with stage_reporter() as report:
         from palpate.build import build_model
@@ -235,6 +234,12 @@ def print_evidence(model: ReducedModel) -> None:
     from palpate.report import evidence_table
 
     console.print(evidence_table(model))
+    if model.evidence.error_in_band > 0.5:
+        console.print(
+            f"[yellow]In the band this model is not the body: {model.method} at order {model.order} leaves the force wrong by "
+            f"{100 * model.evidence.error_in_band:.0f} %. Raise the order, or use tbr-band.[/]",
+            highlight=False,
+        )
 
 
 if __name__ == "__main__":

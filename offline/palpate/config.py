@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,10 +11,20 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from palpate.material import PRESETS, Material, PronySeries
+from palpate.model import LONGEST_PERIOD_S, SHORTEST_PERIOD_S
 
-Point = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
+Count = Annotated[int, Field(strict=True)]
+Point = tuple[Number, Number, Number]
 ReductionMethod = Literal["tbr", "tbr-band", "modal", "modal-static"]
+
+
+MAX_NODES = 100_000
+"""More than this is a slip in a unit: all modes of a tenth of it do not fit into any memory."""
+
+_SHORTEST_TAU_IN_PERIODS = 0.01
+"""A relaxation so much faster than the sampling is a damper, not a branch, and drowns in round-off."""
 
 
 class ConfigError(ValueError):
@@ -30,9 +41,9 @@ class BoxGeometry(_Table):
     shape: Literal["box"]
     lower_m: Point = (0.0, 0.0, 0.0)
     upper_m: Point
-    counts: tuple[int, int, int] = Field(description="nodes along x, y, z, each at least 3")
-    jitter: float = Field(default=0.0, ge=0, le=0.4, description="random shift as a fraction of the spacing")
-    seed: int = 0
+    counts: tuple[Count, Count, Count] = Field(description="nodes along x, y, z, each at least 3")
+    jitter: Number = Field(default=0.0, ge=0, le=0.4, description="random shift as a fraction of the spacing")
+    seed: Count = Field(default=0, ge=0)
 
     @model_validator(mode="after")
     def _is_a_box(self) -> BoxGeometry:
@@ -40,6 +51,8 @@ class BoxGeometry(_Table):
             raise ValueError(f"upper_m = {list(self.upper_m)}: expected above lower_m = {list(self.lower_m)}")
         if min(self.counts) < 3:
             raise ValueError(f"counts = {list(self.counts)}: expected at least 3 along each axis")
+        if math.prod(self.counts) > MAX_NODES:
+            raise ValueError(f"counts = {list(self.counts)}: expected at most {MAX_NODES:,} nodes in all")
         return self
 
 
@@ -50,6 +63,16 @@ class BallGeometry(_Table):
     radius_m: Positive
     spacing_m: Positive
 
+    @model_validator(mode="after")
+    def _is_of_a_size(self) -> BallGeometry:
+        nodes = 4 / 3 * math.pi * (self.radius_m / self.spacing_m) ** 3
+        if not 8 <= nodes <= MAX_NODES:
+            raise ValueError(
+                f"spacing_m = {self.spacing_m:g} in a ball of radius_m = {self.radius_m:g} makes about {nodes:.3g} nodes: "
+                f"expected from 8 to {MAX_NODES:,}"
+            )
+        return self
+
 
 class SurfaceGeometry(_Table):
     """The inside of a closed triangle surface."""
@@ -58,7 +81,7 @@ class SurfaceGeometry(_Table):
     file: str = Field(description="STL, OBJ or PLY, relative to the configuration")
     file_unit: Literal["m", "cm", "mm"] = "m"
     spacing_m: Positive
-    growth: float = Field(
+    growth: Number = Field(
         default=0.3, gt=0, le=0.5, description="growth of the spacing per metre away from a refined contact"
     )
 
@@ -110,7 +133,7 @@ class MaterialTable(_Table):
 
     preset: str | None = None
     youngs_modulus_pa: Positive | None = None
-    poissons_ratio: float | None = Field(default=None, gt=-1, lt=0.5)
+    poissons_ratio: Number | None = Field(default=None, gt=-1, lt=0.5)
     density_kg_per_m3: Positive | None = None
     gamma: tuple[Positive, ...] | None = None
     tau_s: tuple[Positive, ...] | None = None
@@ -145,25 +168,29 @@ class DiscretizationTable(_Table):
     """`conservative` (symmetric, passive; the default) or the paper's `collocation`."""
 
     method: Literal["conservative", "collocation"] = "conservative"
-    support_radius: float = Field(default=2.2, ge=1.2, le=4.0, description="support radius over node spacing")
+    support_radius: Number = Field(
+        default=2.2, ge=1.2, le=4.0, description="support radius over node spacing"
+    )
 
 
 class ReductionTable(_Table):
     """How the full model is reduced and sampled."""
 
     method: ReductionMethod = "tbr-band"
-    order: int | None = Field(default=None, ge=2, description="number of states")
+    order: Count | None = Field(default=None, ge=2, description="number of states")
     tolerance: float | None = Field(
         default=None, gt=0, lt=1, description="largest relative in-band force error"
     )
-    band_hz: tuple[float, float] = (0.0, 30.0)
-    period_s: float = Field(default=1e-3, ge=1e-4, le=1e-1)
+    band_hz: tuple[Number, Number] = (0.0, 30.0)
+    period_s: Number = Field(default=1e-3, ge=SHORTEST_PERIOD_S, le=LONGEST_PERIOD_S)
     sampling: Literal["bilinear", "first-order-hold"] = "bilinear"
 
     @model_validator(mode="after")
     def _one_stop(self) -> ReductionTable:
         if (self.order is None) == (self.tolerance is None):
-            raise ValueError("expected exactly one of order and tolerance")
+            raise ValueError(
+                f"order = {self.order} and tolerance = {self.tolerance}: expected exactly one of them"
+            )
         low, high = self.band_hz
         if not 0 <= low < high < 0.5 / self.period_s:
             raise ValueError(
@@ -198,6 +225,13 @@ class Config(_Table):
                         f"contact {contact.name!r} has spacing_m, but a {self.geometry.shape} is a uniform cloud: "
                         "only a surface can be refined around a contact"
                     )
+        shortest = _SHORTEST_TAU_IN_PERIODS * self.reduction.period_s
+        too_short = [tau for tau in self.material.material().prony.tau_s if tau < shortest]
+        if too_short:
+            raise ValueError(
+                f"material.tau_s holds {too_short[0]:g}: expected at least {shortest:g} s, "
+                f"{_SHORTEST_TAU_IN_PERIODS:g} of reduction.period_s"
+            )
         return self
 
 
@@ -220,7 +254,11 @@ def check_config(tables: dict[str, Any], origin: str) -> Config:
     try:
         return Config.model_validate(tables)
     except ValidationError as error:
-        raise ConfigError("\n".join(f"{origin}: {_line(e)}" for e in error.errors())) from error
+        mistakes = error.errors()
+        # A list whose entries are wrong is also told to be too short: that follows, and helps nobody.
+        entries = {e["loc"][0] for e in mistakes if len(e["loc"]) > 1}
+        told = [e for e in mistakes if not (e["type"] == "too_short" and e["loc"][0] in entries)]
+        raise ConfigError("\n".join(f"{origin}: {_line(e)}" for e in told)) from error
 
 
 def override_reduction(
@@ -268,6 +306,8 @@ def _line(error: Any) -> str:
     key = key or "configuration"
     value = error["input"]
     message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "tuple_type" and len(parts) == 1 and parts[0] in ("fixed", "contact"):
+        return f"{key}: expected a list of tables, [[{key}]]"
     if error["type"] == "missing":
         return f"{key}: missing, it is required"
     if error["type"] == "extra_forbidden":

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import tempfile
+import zipfile
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 
 FORMAT = "palpate.reduced-model"
 SCHEMA_VERSION = 1
+
+SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-4, 1e-1
 
 UNITS = {
     "length": "m",
@@ -211,6 +214,20 @@ class ReducedModel:
         }
 
 
+def check_writable(path: Path) -> None:
+    """Raise OSError where a model could not be saved at `path`: better before a long build than after it."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: expected the name of a model file")
+    folder = path.parent
+    while not folder.exists():
+        folder = folder.parent
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(f"{path}: nothing can be written to {folder} ({error.strerror})") from error
+
+
 def save_model(model: ReducedModel, path: Path) -> None:
     """Write the model to a temporary file beside `path`, then rename: readers see the old file or the whole new one."""
     scalars = {
@@ -260,27 +277,29 @@ def load_model(path: Path) -> ReducedModel:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such model file")
+    if not zipfile.is_zipfile(path):
+        raise ModelFileError(f"{path}: damaged or not an .npz archive")
     try:
-        archive = np.load(path, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise ModelFileError(f"{path}: a single array, expected an .npz archive")
-        with archive:
+        with np.load(path, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
-    except ModelFileError:
-        raise
     except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds on damaged bytes
-        raise ModelFileError(f"{path}: damaged or not an .npz archive ({error})") from error
+        raise ModelFileError(f"{path}: damaged or not an .npz archive ({_without_advice(error)})") from error
     try:
         return _assemble(arrays)
     except ModelFileError as error:
         raise ModelFileError(f"{path}: {error}") from error
 
 
+def _without_advice(error: Exception) -> str:
+    """numpy's own words on pickled data end in how to load it unsafely, which nobody is to follow."""
+    return "it holds pickled objects" if "pickle" in str(error) else str(error)
+
+
 def _assemble(arrays: dict[str, NDArray[Any]]) -> ReducedModel:
     if "metadata" not in arrays:
         raise ModelFileError("no field 'metadata': not a palpate model")
     try:
-        scalars = json.loads(arrays["metadata"].tobytes())
+        scalars = json.loads(arrays["metadata"].tobytes(), parse_constant=_refuse_constant)
         if scalars["format"] != FORMAT:
             raise ModelFileError(f"format is {scalars['format']!r}, expected {FORMAT!r}: not a palpate model")
         version = scalars["schema_version"]
@@ -302,8 +321,7 @@ def _assemble(arrays: dict[str, NDArray[Any]]) -> ReducedModel:
         n_vertices = _count(arrays, "surface_vertices")
         n_triangles = _count(arrays, "surface_triangles")
         n_poles = _count(arrays, "full_poles")
-        evidence_fields = dict(scalars["evidence"])
-        evidence_fields["band_hz"] = tuple(evidence_fields["band_hz"])
+        evidence_fields = {k: _numbers(k, v) for k, v in scalars["evidence"].items()}
         model = ReducedModel(
             name=str(scalars["name"]),
             method=str(scalars["method"]),
@@ -346,9 +364,37 @@ def _assemble(arrays: dict[str, NDArray[Any]]) -> ReducedModel:
     return model
 
 
+def _refuse_constant(text: str) -> None:
+    raise ModelFileError(f"the metadata holds {text}: expected finite numbers")
+
+
+def _numbers(name: str, value: Any) -> Any:
+    """A number of the evidence, None where there is no bound, or the band's two."""
+    if name == "error_bound" and value is None:
+        return None
+    values = value if name == "band_hz" else [value]
+    if not (isinstance(values, list) and all(type(v) in (int, float) for v in values)):
+        raise ModelFileError(f"field 'evidence.{name}' is {value!r}: expected a number")
+    if name == "band_hz":
+        low, high = values
+        return float(low), float(high)
+    return float(value)
+
+
 def _check(model: ReducedModel) -> None:
-    if not (np.isfinite(model.period_s) and model.period_s > 0):
-        raise ModelFileError(f"field 'period_s' is {model.period_s}: expected a number above 0")
+    if not SHORTEST_PERIOD_S <= model.period_s <= LONGEST_PERIOD_S:
+        raise ModelFileError(
+            f"field 'period_s' is {model.period_s}: expected from {SHORTEST_PERIOD_S:g} to {LONGEST_PERIOD_S:g}"
+        )
+    names = [contact.name for contact in model.contacts]
+    if len(set(names)) < len(names):
+        raise ModelFileError(f"field 'contacts' names {names}: expected each name once")
+    for contact in model.contacts:
+        length = float(np.linalg.norm(contact.normal))
+        if not abs(length - 1) < 1e-6:
+            raise ModelFileError(
+                f"field 'contacts' has a normal of length {length:g} at {contact.name!r}: expected a unit vector"
+            )
     triangles, n_vertices = model.surface.triangles, len(model.surface.vertices)
     if triangles.size and not (triangles.min() >= 0 and triangles.max() < n_vertices):
         raise ModelFileError(f"field 'surface_triangles' names vertices outside 0..{n_vertices - 1}")

@@ -8,10 +8,17 @@ from rich.table import Table
 
 from palpate.model import ReducedModel
 
+_NOTABLE = 0.1  # a relative error above this is not what a model is built for
+
 
 def percent(fraction: float) -> str:
     """A relative error in percent with two significant digits, three from 100 % up."""
     return f"{100 * fraction:.2g} %" if fraction < 0.995 else f"{100 * fraction:.0f} %"
+
+
+def marked(fraction: float) -> str:
+    """The same, in yellow where nobody should overlook it."""
+    return f"[yellow]{percent(fraction)}[/]" if fraction > _NOTABLE else percent(fraction)
 
 
 def evidence_table(model: ReducedModel) -> Table:
@@ -34,15 +41,13 @@ def evidence_table(model: ReducedModel) -> Table:
         f"{model.n_states_full:,} → {model.order}",
         f"{model.n_nodes:,} nodes",
     )
-    table.add_row("error in band", percent(evidence.error_in_band), f"force, largest in {low:g}-{high:g} Hz")
-    table.add_row(
-        "before sampling", percent(evidence.error_in_band_continuous), "the reduction's share of it"
-    )
-    table.add_row("error at 0 Hz", percent(evidence.error_static), "static force")
+    table.add_row("error in band", marked(evidence.error_in_band), f"force, largest in {low:g}-{high:g} Hz")
+    table.add_row("before sampling", marked(evidence.error_in_band_continuous), "the reduction's share of it")
+    table.add_row("error at 0 Hz", marked(evidence.error_static), "static force")
     table.add_row("error, H-infinity", percent(evidence.error_hinf), "of the largest response")
     table.add_row("bound, H-infinity", bound, "a priori")
-    table.add_row("error in time", percent(evidence.error_time_domain), "force during a poke")
-    table.add_row("error of the surface", percent(evidence.error_surface_in_band), "displacement in the band")
+    table.add_row("error in time", marked(evidence.error_time_domain), "force during a poke")
+    table.add_row("error of the surface", marked(evidence.error_surface_in_band), "displacement in the band")
     table.add_row(
         "spectral abscissa",
         f"{evidence.spectral_abscissa:.3g}",

@@ -115,6 +115,11 @@ def test_method_and_order_can_be_chosen_on_the_command_line(slab: tuple[Path, st
         (["build", "slab.toml", "--tolerance", "200%"], "'200%'"),
         (["build", "slab.toml", "--tolerance", "2%", "--order", "20"], "exclude each other"),
         (["build", "slab.toml", "--method", "pod"], "reduction.method = 'pod'"),
+        (
+            ["build", "slab.toml", "-o", "slab.toml/x.npz"],
+            "slab.toml/x.npz: nothing can be written to slab.toml",
+        ),
+        (["build", "slab.toml", "-o", "."], "is a folder"),
         (["inspect", "slab.toml"], "slab.toml: damaged or not an .npz archive"),
         (["inspect", "none.npz"], "none.npz: no such model file"),
     ],
@@ -129,6 +134,27 @@ def test_a_mistake_ends_in_one_plain_message_and_exit_code_2(
     assert says in done.stderr
     assert "Traceback" not in done.stderr
     assert sorted(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("point_m = [0.03, 0.03, 0.03]", "point_m = [0.03, 0.03, 0.93]", "contact 'tip': point_m = [0.03, 0.03, 0.93] is 0.9 m"),
+        ("radius_m = 0.011", "radius_m = 10.0", "contact 'tip': radius_m = 10 holds"),
+        ("point_m = [0.03, 0.03, 0.03]", "point_m = [0.03, 0.03, 0.0]", "contact 'tip' and a fixed region share node"),
+        ("normal = [0.0, 0.0, -1.0]", "normal = [0.0, 0.0, 0.0]", "fixed[0]: "),
+        ("counts = [7, 7, 4]\njitter = 0.1", "counts = [30, 30, 30]", "GiB"),
+    ],
+)  # fmt: skip
+def test_a_scene_that_makes_no_sense_is_refused_by_the_name_of_its_part(
+    tmp_path: Path, old: str, new: str, says: str
+) -> None:
+    (tmp_path / "odd.toml").write_text(SLAB.replace(old, new))
+    done = palpate("build", "odd.toml", folder=tmp_path)
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["odd.toml"]
 
 
 def test_a_scene_that_can_not_be_built_leaves_no_file(slab: tuple[Path, str], tmp_path: Path) -> None:

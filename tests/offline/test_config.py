@@ -76,6 +76,17 @@ def test_every_shipped_scene_is_valid(scene: Path) -> None:
     ("path", "value", "says"),
     [
         ("geometry.counts", [5, 2, 3], ["geometry", "counts", "[5, 2, 3]", "at least 3"]),
+        ("geometry.counts", [400, 400, 400], ["geometry", "[400, 400, 400]", "100,000 nodes"]),
+        (
+            "geometry",
+            {"shape": "ball", "radius_m": 1.0, "spacing_m": 1e-3},
+            ["geometry", "nodes", "100,000"],
+        ),
+        ("geometry.seed", -3, ["geometry.seed", "-3", "0"]),
+        ("fixed.0.point_m", [float("nan"), 0.0, 0.0], ["fixed[0].point_m[0]", "nan", "finite"]),
+        ("fixed", {"region": "plane"}, ["fixed", "[[fixed]]"]),
+        ("contact.0.radius_m", True, ["contact[0].radius_m", "True", "number"]),
+        ("material.tau_s", [1e-12], ["tau_s", "1e-12", "1e-05"]),
         ("geometry.shape", "sphere", ["geometry.shape", "'sphere'", "'box'", "'ball'", "'surface'"]),
         ("geometry.shape", None, ["geometry.shape", "'box'"]),
         ("geometry.upper_m", [1.0, 0.0, 1.0], ["geometry", "upper_m", "above lower_m"]),
@@ -115,6 +126,12 @@ def test_two_contacts_with_one_name_are_refused() -> None:
     scene["contact"] = scene["contact"] * 2
     with pytest.raises(ConfigError, match="each name once"):
         check_config(scene, "slab.toml")
+
+
+def test_a_wrong_entry_of_a_list_is_told_once() -> None:
+    with pytest.raises(ConfigError) as caught:
+        check_config(changed("fixed.0.region", "line"), "slab.toml")
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_every_mistake_gets_its_own_line() -> None:
