@@ -13,6 +13,8 @@ import statistics
 import tempfile
 from pathlib import Path
 
+import numpy as np
+
 from palpate.model import load_model, save_model
 from palpate_server import wire
 from palpate_server.round_trips import RATE_HZ, RoundTrips, encode_command, ping_pong, through_a_model
@@ -31,8 +33,8 @@ def main() -> None:
             save_model(spring_mass_model(n_modes=50), path)
         model = load_model(path)
         contact = model.contacts[0].name
-        inputs, motion = [[10**6] * 4] * len(model.contacts), [[0.1] * 8] * len(model.contacts)
-        force_bytes = len(wire.encode_force(10**6, 10**15, inputs, motion))
+        n = len(model.contacts)
+        force_bytes = len(wire.ForceEncoder(n).encode(0, 0, np.zeros((n, 4), np.int64), np.zeros((n, 8))))
         command_bytes = len(encode_command(contact, 10**6, 10**15))
         print(
             f"order {model.order}, {len(model.contacts)} contacts; "

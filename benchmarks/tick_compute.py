@@ -106,11 +106,11 @@ def row(order: int, contacts: int, runs: int) -> None:
     after = rtsys.get_allocation_stats()
     _nrt.memsys_disable_stats()
     tick = best(runs, lambda: run_ticks(STEPS, image, start, period))
-    inputs_row, motion_row = memory.record_inputs[0].tolist(), memory.record_motion[0].tolist()
+    encoder = wire.ForceEncoder(contacts)
 
     def encode() -> None:
         for k in range(STEPS):
-            wire.encode_force(k, start, inputs_row, motion_row)
+            encoder.encode(k, start, memory.record_inputs[0], memory.record_motion[0])
 
     print(
         f"{order:5d} {channels:8d} | {blocks:7.2f} {blas:7.2f} {blas / blocks:7.1f} | "

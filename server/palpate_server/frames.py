@@ -14,6 +14,8 @@ from palpate_server.compiled import compiled
 Floats = NDArray[np.float64]
 
 _ORTHONORMAL = 1e-6
+SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
+FARTHEST_ORIGIN_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -21,8 +23,8 @@ class Frame:
     """displacement in the model = scale · rotation · (device position - origin_m).
 
     rotation  (3, 3) rows, orthonormal, device axes to model axes
-    scale     above 0: how much larger motion is in the model than at the device
-    origin_m  the device position at which the tip is at rest on the undeformed surface
+    scale     1e-3 to 1e3: how much larger motion is in the model than at the device
+    origin_m  the device position at which the tip is at rest on the undeformed surface, within 10 m an axis
 
     Forces go back as scale · rotation^T · force, so that power is the same on both sides: the frame neither adds
     energy to a device nor takes any.
@@ -58,9 +60,16 @@ def read_frame(value: object) -> Frame:
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(matrix) < 0:
         raise ValueError(f"frame rotation is {rows!r}: expected an orthonormal, right-handed matrix")
     scale = value.get("scale", 1.0)
-    if not (_is_number(scale) and scale > 0):
-        raise ValueError(f"frame scale is {scale!r}: expected a number above 0")
-    return Frame(rotation, float(scale), _three("origin_m", value.get("origin_m", (0.0, 0.0, 0.0))))
+    if not (_is_number(scale) and SMALLEST_SCALE <= scale <= LARGEST_SCALE):
+        raise ValueError(
+            f"frame scale is {scale!r}: expected a number from {SMALLEST_SCALE:g} to {LARGEST_SCALE:g}"
+        )
+    origin = _three("origin_m", value.get("origin_m", (0.0, 0.0, 0.0)))
+    if max(map(abs, origin)) > FARTHEST_ORIGIN_M:
+        raise ValueError(
+            f"frame origin_m is {list(origin)}: expected no component beyond {FARTHEST_ORIGIN_M:g} m"
+        )
+    return Frame(rotation, float(scale), origin)
 
 
 def _three(name: str, value: Any) -> tuple[float, float, float]:

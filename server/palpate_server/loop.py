@@ -558,6 +558,14 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
         flags |= safety.bound(
             force, m.previous_force[i], m.limits[i, MAX_FORCE_RATE] * period_s, m.limits[i, MAX_FORCE]
         )
+        if not math.isfinite(force[0] + force[1] + force[2] + m.energy[i]):
+            # The last word before the device: whatever went wrong above, it feels nothing, and the next client starts
+            # from a clean state.
+            m.counters[FAULTS] += 1
+            force[:] = 0.0
+            m.energy[i] = 0.0
+            m.scale[i] = 0.0
+            flags |= _FAULT
         m.record_inputs[row, i, CONTACT_FLAGS] |= flags
         motion = m.record_motion[row, i]
         for j in range(3):

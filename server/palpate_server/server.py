@@ -80,6 +80,7 @@ class Server:
         self._stopping = threading.Event()
         self._wake = os.eventfd(0)
         self._sending = threading.Lock()
+        self._encoder = wire.ForceEncoder(len(self.names))
         self._sent = 0
 
     # Start and stop
@@ -202,11 +203,9 @@ class Server:
                 self._sent = head - MAX_UNSENT
             while self._sent < head:
                 row = self._sent % loop.RECORDS
-                payload = wire.encode_force(
-                    self._sent,
-                    int(memory.record_times[row, loop.START_NS]),
-                    memory.record_inputs[row].tolist(),
-                    memory.record_motion[row].tolist(),
+                start_ns = int(memory.record_times[row, loop.START_NS])
+                payload = self._encoder.encode(
+                    self._sent, start_ns, memory.record_inputs[row], memory.record_motion[row]
                 )
                 self._force.put(payload)
                 self._sent += 1
@@ -397,7 +396,9 @@ class Server:
                     "unknown_limit", f"no limit is called {field!r}: there are {', '.join(Limits._fields)}"
                 )
             value, ceiling = _optional_number(wanted, field), getattr(self.limits, field)
-            if field != "max_damping_n_s_per_m" and not (value and value <= ceiling):
+            if value is None:
+                raise wire.MalformedMessage("wrong_type", f"{field} is None: expected a number")
+            if field != "max_damping_n_s_per_m" and not 0 < value <= ceiling:
                 raise Refused("limit_too_high", f"{field} is {value}: expected above 0, at most {ceiling}")
         for name in held:
             terms = self.leases.terms[name]
@@ -520,6 +521,7 @@ def warm_up(period_s: float, n_contacts: int) -> None:
     image = make_image(memory)
     loop.tick_on_arrival(image, time.monotonic_ns())
     loop.records_written(memory.shared)
+    wire.ForceEncoder(n_contacts).encode(0, 0, memory.record_inputs[0], memory.record_motion[0])
     loop.is_silent(image, 0)
     loop.set_frame(image, 0, np.eye(3), 1.0, np.zeros(3))
     loop.set_limits(image, 0, np.ones(5))

@@ -387,3 +387,27 @@ def test_a_snapshot_belongs_to_one_tick(make_spring_mass_model: Callable[..., Re
         assert loop.read_snapshot(make_image(memory), state, applied) == i
         np.testing.assert_allclose(state, expected, rtol=1e-12, atol=1e-18)
         expected = system.dense_a() @ expected + system.b @ applied.ravel()
+
+
+def test_a_force_that_is_no_number_never_reaches_the_device_and_the_next_client_starts_clean(
+    memory: loop.Memory,
+) -> None:
+    """The last check before the wire, whatever the terms of a contact were: here a limit that is not a number."""
+    image = make_image(memory)
+    broken = np.array(FREE._replace(max_damping_n_s_per_m=float("nan")))
+    loop.set_limits(image, 0, broken)
+    faults = memory.counters[loop.FAULTS]
+    for i in range(300):
+        command(memory, i, (1e-3 * np.sin(0.3 * i), 0.0, 0.0))
+        _, _, force, _ = tick(memory)
+        assert np.all(np.isfinite(force))
+    seen = memory.counters[loop.FAULTS] - faults
+    assert seen > 0
+    loop.set_limits(image, 0, np.array(FREE))
+    for i in range(300, 600):
+        command(memory, i, (1e-3 * np.sin(0.3 * i), 0.0, 0.0))
+        flags, _, force, scale = tick(memory)
+        assert np.all(np.isfinite(force))
+    assert not flags & Flags.FAULT
+    assert scale == 1
+    assert np.any(force)

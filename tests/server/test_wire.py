@@ -108,18 +108,31 @@ def test_names_that_could_change_a_key_expression_are_refused(name: object) -> N
     assert not wire.is_name(name)
 
 
-def test_forces_carry_numbers_unchanged() -> None:
-    motion = [[0.1, 0.2, 0.3, 1 / 3, -2 / 3, 1e-300, 0.5, 0.25]]
-    message = msgpack.unpackb(wire.encode_force(9, 10, [[1, 2, 3, 4]], motion))
-    assert message["force_n"] == [motion[0][3:6]]
-    assert message["displacement_m"] == [motion[0][0:3]]
-    assert message["force_scale"] == [0.5]
-    assert (message["sequence"], message["client_time_ns"], message["input_age_ns"], message["flags"]) == (
-        [1],
-        [2],
-        [3],
-        [4],
-    )
+@settings(deadline=None)
+@given(
+    n_contacts=st.integers(1, 40),
+    tick=st.integers(0, 2**62),
+    number=st.floats(allow_nan=False),
+    integer=st.integers(-(2**63), 2**63 - 1),
+)
+def test_forces_carry_every_number_unchanged(n_contacts: int, tick: int, number: float, integer: int) -> None:
+    random = np.random.default_rng(tick % 1000)
+    inputs = random.integers(-1, 2**40, (n_contacts, 4))
+    motion = random.normal(size=(n_contacts, 8))
+    inputs[-1, 1], motion[-1, 4] = integer, number
+    payload = wire.ForceEncoder(n_contacts).encode(tick, 10, inputs, motion)
+    assert msgpack.unpackb(payload) == {
+        "tick": tick,
+        "server_time_ns": 10,
+        "sequence": inputs[:, 0].tolist(),
+        "client_time_ns": inputs[:, 1].tolist(),
+        "input_age_ns": inputs[:, 2].tolist(),
+        "flags": inputs[:, 3].tolist(),
+        "displacement_m": motion[:, 0:3].tolist(),
+        "force_n": motion[:, 3:6].tolist(),
+        "force_scale": motion[:, 6].tolist(),
+        "energy_j": motion[:, 7].tolist(),
+    }
 
 
 def test_surface_displacements_are_little_endian_float32() -> None:
@@ -163,7 +176,7 @@ def test_the_page_lists_the_keys_of_the_code() -> None:
 
 
 def test_the_page_lists_exactly_the_fields_of_a_force() -> None:
-    message = msgpack.unpackb(wire.encode_force(0, 0, [[0] * 4], [[0.0] * 8]))
+    message = msgpack.unpackb(wire.ForceEncoder(1).encode(0, 0, np.zeros((1, 4), np.int64), np.zeros((1, 8))))
     assert [row[0].strip("`") for row in _table("Force")] == list(message)
 
 
