@@ -10,8 +10,7 @@ from numba import njit
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Sums may be reordered and fused (that is what vectorises a dot product); infinities and NaN keep their meaning,
-# because the loop tests for them.
+# Sums may be reordered and fused: that is what vectorises a dot product.
 FAST_MATH = {"reassoc", "contract", "nsz"}
 
 
@@ -25,9 +24,14 @@ def compiled_without_gil(function: Function) -> Function:
     return _compile(function, nogil=True)
 
 
-def _compile(function: Function, *, nogil: bool) -> Function:
+def compiled_exactly(function: Function) -> Function:
+    """Compile `function` with every operation as written: a test for NaN on sums that may be reordered is optimised away."""
+    return _compile(function, nogil=False, fast_math=set())
+
+
+def _compile(function: Function, *, nogil: bool, fast_math: set[str] = FAST_MATH) -> Function:
     try:
-        return cast(Function, njit(cache=True, nogil=nogil, fastmath=FAST_MATH)(function))
+        return cast(Function, njit(cache=True, nogil=nogil, fastmath=fast_math)(function))
     except (
         RuntimeError
     ) as error:  # no cache directory is writable: a read-only container, another user's files
@@ -37,4 +41,4 @@ def _compile(function: Function, *, nogil: bool) -> Function:
             RuntimeWarning,
             stacklevel=3,
         )
-        return cast(Function, njit(cache=False, nogil=nogil, fastmath=FAST_MATH)(function))
+        return cast(Function, njit(cache=False, nogil=nogil, fastmath=fast_math)(function))

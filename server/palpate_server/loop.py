@@ -11,7 +11,6 @@ that is skipped: model time then stands still, and the skipped ticks are counted
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -524,10 +523,7 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
             if share > 0.0:
                 m.force[i, j] += share * (m.next_model.force[i, j] - model.force[i, j])
 
-    finite = True
-    for i in range(n_contacts):
-        for j in range(3):
-            finite &= math.isfinite(m.force[i, j])
+    finite = safety.all_finite(m.force.reshape(3 * n_contacts))
     if not finite:
         m.counters[FAULTS] += 1
         model.state[:] = 0.0
@@ -558,7 +554,7 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
         flags |= safety.bound(
             force, m.previous_force[i], m.limits[i, MAX_FORCE_RATE] * period_s, m.limits[i, MAX_FORCE]
         )
-        if not math.isfinite(force[0] + force[1] + force[2] + m.energy[i]):
+        if not (safety.all_finite(force) and safety.all_finite(m.energy[i : i + 1])):
             # The last word before the device: whatever went wrong above, it feels nothing, and the next client starts
             # from a clean state.
             m.counters[FAULTS] += 1

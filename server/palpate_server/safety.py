@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_server.compiled import compiled
+from palpate_server.compiled import compiled, compiled_exactly
 
 Floats = NDArray[np.float64]
 
@@ -106,6 +106,15 @@ def fade(scale: float, live: bool, period_ns: int) -> float:
     if live:
         return min(1.0, scale + period_ns / SOFT_START_NS)
     return max(0.0, scale - period_ns / DECAY_NS)
+
+
+@compiled_exactly
+def all_finite(values: Floats) -> bool:
+    """Whether every one of values (n,) is a finite number."""
+    for value in values:  # noqa: SIM110, numba has no all()
+        if not math.isfinite(value):
+            return False
+    return True
 
 
 @compiled

@@ -282,6 +282,9 @@ def test_a_device_brings_its_limits_its_frame_and_warnings(
         assert (granted, refusal["reason"]) == (False, "unknown_device")
         granted, refusal = client.query("control/acquire", request | {"frame": {"scale": -1}})
         assert (granted, refusal["reason"]) == (False, "wrong_type")
+        nothing = {"client": client.name, "limits": {"max_damping_n_s_per_m": None}}
+        granted, refusal = client.query("control/limits", nothing)
+        assert (granted, refusal["reason"]) == (False, "wrong_type")
 
         limits = {"client": client.name, "limits": {"max_force_n": 1.5}}
         granted, answer = client.query("control/limits", limits)
