@@ -163,17 +163,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         timer.start()
     try:
         keys = wire.Keys(options.session)
-        with (
-            transport.connect_session(options.connect, options.zenoh_config) as session,
-            options.out.open("wb") as stream,
-        ):
-            recording = Recording(stream)
-            print(f"recording {keys.prefix} to {options.out}; Ctrl-C ends it", flush=True)
+        with transport.connect_session(options.connect, options.zenoh_config) as session:
+            stream = options.out.open("wb")
             try:
+                recording = Recording(stream)
+                print(f"recording {keys.prefix} to {options.out}; Ctrl-C ends it", flush=True)
                 record(session, keys, recording, stop)
                 recording.finish()
+                stream.close()
             except OSError as error:
                 print(f"palpate record: {options.out}: {error.strerror}; it ends here", file=sys.stderr)
+                with contextlib.suppress(OSError):  # what could not be written can't be written now
+                    stream.close()
                 return 1
     except (OSError, ValueError, transport.TransportError) as error:
         print(f"palpate record: {error}", file=sys.stderr)

@@ -58,7 +58,7 @@ def test_a_recording_is_complete_after_sigterm_and_repeats_bit_for_bit(
         served = serve()
         out = tmp_path / f"{attempt}.mcap"
         recorder = start_recorder(out, served.endpoint)
-        client = run_example("device_bridge.py", served.endpoint, "--duration-s", "1.5")
+        client = run_example("headless_client.py", served.endpoint, "--duration-s", "2")
         _, err = client.communicate(timeout=60)
         assert client.returncode == 0, err
         recorder.terminate()
@@ -78,17 +78,15 @@ def test_a_recording_is_complete_after_sigterm_and_repeats_bit_for_bit(
         session = replay.read_session(out)
         model = load_model(tmp_path / "model1.npz")
         result = replay.compare(session, model)
-        if result.lost_commands == 0:  # with passivity control the energy needs what the commands told
-            assert result.difference is None
-        if result.ticks > 1000 and result.lost_commands == 0:
+        assert result.difference is None
+        if any(message["force_scale"][0] > 0 for message in session.forces[: result.ticks - 100]):
             break
         served.stop()
     else:
-        raise AssertionError("messages were lost in every one of 5 recordings")
-    assert any(message["force_scale"][0] == 1 for message in session.forces[: result.ticks])
+        raise AssertionError("forces were lost before the first movement in every one of 5 recordings")
 
     changed = [dict(message) for message in session.forces]
-    victim = next(i for i, m in enumerate(changed) if m["force_scale"][0] == 1)
+    victim = next(i for i, m in enumerate(changed) if m["force_scale"][0] > 0)
     force = changed[victim]["force_n"][0]
     changed[victim]["force_n"] = [[force[0], force[1], force[2] + 1e-12]]
     session.forces = changed
