@@ -8,7 +8,8 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -86,7 +87,10 @@ class Server:
     # Start and stop
 
     def start(self) -> None:
-        warm_up(self.model.period_s, len(self.names))
+        with _notice_after(
+            2.0, "compiling the real-time functions, once for this machine: about half a minute"
+        ):
+            warm_up(self.model.period_s, len(self.names))
         session, keys = self.session, self.keys
         real_time = zenoh.Priority.REAL_TIME
         drop = zenoh.CongestionControl.DROP
@@ -502,6 +506,18 @@ def describe(model: ReducedModel, limits: Limits, session: str) -> dict[str, Any
         "flags": {flag.name: flag.value for flag in Flags},
         "model": summary,
     }
+
+
+@contextmanager
+def _notice_after(seconds: float, text: str) -> Iterator[None]:
+    """Say what is going on when it takes longer than this."""
+    timer = threading.Timer(seconds, log.info, [text])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def warm_up(period_s: float, n_contacts: int) -> None:
