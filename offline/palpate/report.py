@@ -59,6 +59,9 @@ def evidence_table(model: ReducedModel) -> Table:
         "below 0: can give out energy",
     )
     table.add_row(
+        "passive up to", f"{evidence.passive_up_to_hz:.3g} Hz", "only faster pokes can get energy out"
+    )
+    table.add_row(
         "energy given out",
         f"{evidence.largest_energy_out_j:.2g} J",
         "at most, by a closed poke of 1 mm",

@@ -65,6 +65,7 @@ def small_model() -> ReducedModel:
             spectral_abscissa=-1.0,
             spectral_abscissa_full=-0.9,
             passivity_margin=-1e-5,
+            passive_up_to_hz=425.0,
             largest_energy_out_j=1e-9,
             resolved_frequency_hz=22.0,
             band_hz=(0.0, 30.0),

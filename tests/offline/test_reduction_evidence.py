@@ -12,7 +12,7 @@ from palpate.reduction.block_form import from_block_form, to_block_form
 from palpate.reduction.evidence import hinf_error, poke, step_through, time_domain_error
 from palpate.reduction.frequencies import maximum
 from palpate.reduction.gramians import real_form
-from palpate.reduction.passivity import largest_energy_out, passivity_margin, worst_poke
+from palpate.reduction.passivity import largest_energy_out, passive_up_to, passivity_margin, worst_poke
 from palpate.system import ElasticModes
 from palpate.viscoelastic import viscoelastic_system
 
@@ -233,3 +233,20 @@ def test_surface_shapes_that_do_not_match_the_modes_are_named(modes, full):
             period_s=PERIOD_S,
             band_hz=(0.0, 30.0),
         )
+
+
+def test_a_system_that_turns_active_says_from_which_frequency_on(full):
+    pair = DiagonalSystem(
+        np.array([-3 + 40j, -60 + 900j]),
+        np.array([[4.0 + 0j], [30.0 + 0j]]),
+        np.array([[4.0j, -30.0j]]),
+        np.array([[500.0]]),
+        np.arange(2),
+    )
+    running = from_block_form(discretise(to_block_form(pair), PERIOD_S))
+    theta = np.linspace(1e-4, np.pi, 200001)
+    imaginary = running.transfer(np.exp(1j * theta))[:, 0, 0].imag
+    first = theta[np.argmax(imaginary < 0)]
+    assert 0 < first < np.pi
+    assert passive_up_to(running) == pytest.approx(first, abs=1e-4)
+    assert passive_up_to(from_block_form(discretise(to_block_form(full), PERIOD_S))) == np.pi

@@ -16,7 +16,7 @@ from palpate.reduction.frequencies import (
     spectral_norms,
 )
 from palpate.reduction.methods import Reduction
-from palpate.reduction.passivity import largest_energy_out, passivity_margin
+from palpate.reduction.passivity import largest_energy_out, passive_up_to, passivity_margin
 
 Array = NDArray[np.float64]
 
@@ -58,6 +58,7 @@ def measure(
         spectral_abscissa=reduction.system.spectral_abscissa,
         spectral_abscissa_full=full.spectral_abscissa,
         passivity_margin=passivity_margin(running),
+        passive_up_to_hz=passive_up_to(running) / (2 * np.pi * period_s),
         largest_energy_out_j=largest_energy_out(running, _POKE_AMPLITUDE_M),
         resolved_frequency_hz=resolved_frequency_hz,
         band_hz=band_hz,

@@ -32,6 +32,28 @@ def passivity_margin(discrete: DiagonalSystem) -> float:
     return -worst / float(spectral_norms(discrete.transfer(np.ones(1, dtype=np.complex128)))[0])
 
 
+def passive_up_to(discrete: DiagonalSystem) -> float:
+    """Angle a sample, 0..pi, below which no sinusoidal poke gets energy out; pi where none does at any.
+
+    What round-off leaves (1e-9 of the static stiffness) does not count.
+    """
+    theta = _angles(discrete)
+    static = float(spectral_norms(discrete.transfer(np.ones(1, dtype=np.complex128)))[0])
+    active = np.flatnonzero(_least_dissipation(discrete, theta)[0] < -1e-9 * static)
+    if not len(active):
+        return float(np.pi)
+    # Where it begins lies between this sample and the one before: bisect.
+    high = theta[active[0]]
+    low = theta[active[0] - 1] if active[0] else 0.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        if _least_dissipation(discrete, np.array([middle]))[0][0] < -1e-9 * static:
+            high = middle
+        else:
+            low = middle
+    return float(low)
+
+
 def largest_energy_out(discrete: DiagonalSystem, amplitude_m: float) -> float:
     """Largest work, J, that one closed sinusoidal poke of |a| = amplitude_m gets out; 0 where none does."""
 
