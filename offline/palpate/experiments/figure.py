@@ -54,8 +54,19 @@ class Figure:
 
         canvas = plt.figure(figsize=self.size, layout="constrained")
         self.draw(canvas)
-        canvas.savefig(folder / f"{self.stem}.png", dpi=95)
+        path = folder / f"{self.stem}.png"
+        canvas.savefig(path, dpi=95)
         plt.close(canvas)
+        _use_palette(path)
+
+
+def _use_palette(path: Path) -> None:
+    """256 colours are enough for lines and text, in half the bytes."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        reduced = image.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    reduced.save(path, optimize=True)
 
 
 def _text(cell: Cell) -> str:

@@ -38,7 +38,7 @@ This page is written by `palpate reproduce --out docs`, numbers included; every 
 ## What the paper leaves open, and what we do
 
 - **D.** The paper sets D = 0 in Eq. 35. With a displacement as input and a force as output D is the instant stiffness of the
-  tip; it is the largest number in the response. We keep it.
+  tip, several times its stiffness at rest. We keep it.
 - **E and ν** of the cube are not stated: 1 Pa and 0.3 here. Neither are the amplitude and frequency of its sine: 10 mm and
   0.2 Hz, one period in the 5 s; nor the order of its reduced models.
 - **States.** The paper counts two states a degree of freedom. The memory of the material (Eq. 9) is a third one in our exact
@@ -61,7 +61,8 @@ This page is written by `palpate reproduce --out docs`, numbers included; every 
   paper's collocation beside it.
 - **Solution time.** Reduced models run as real 2 x 2 blocks in one compiled loop, 1 ms a step; processor time, the median of five
   runs. The full model runs in the same loop with all its modes, and by Newmark's method with one sparse factorisation (SuperLU
-  through SciPy, some tens of µs of interpreter a step). Reductions are timed once by the wall clock, beside other work.
+  through SciPy, some tens of µs of interpreter a step). Reductions are timed once by the wall clock, beside other
+  work: differences below a factor of two are the machine's.
 """
 
 
