@@ -130,8 +130,8 @@ class Evidence:
     spectral_abscissa_full the same of the full model, 1/s
     passivity_margin       smallest eigenvalue, over all frequencies, of the part of the discrete force response that
                            dissipates, (F - F^H) / 2j, over |F(0)|; negative: the model can give out energy
-    passive_up_to_hz       no sinusoidal poke slower than this gets energy out of the discrete model; half the sampling
-                           rate where it is passive throughout
+    passive_up_to_hz       no sinusoidal poke slower than this gets energy out of the discrete model (more than a margin of
+                           -0.001 would); half the sampling rate where it is passive throughout
     largest_energy_out_j   the most energy it can give out in one closed sinusoidal poke of 1 mm amplitude, J
     resolved_frequency_hz  up to where the cloud carries shear waves with 6 nodes a wavelength
     band_hz                the haptic band
