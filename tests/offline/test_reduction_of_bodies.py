@@ -1,19 +1,17 @@
 """The reductions on whole bodies: the paper's cube with 8,067 states and the shipped liver."""
 
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from palpate.diagonal_system import DiagonalSystem
+from palpate.build import build_model
+from palpate.config import check_config, load_config
+from palpate.diagonal_system import DiagonalSystem, full_system
 from palpate.discretization import collocation, conservative
-from palpate.geometry.fill import fill_surface
-from palpate.geometry.regions import PlaneRegion, contact_patch, nodes_in
 from palpate.geometry.shapes import box_lattice
-from palpate.geometry.spacing import Refinement
-from palpate.geometry.surface import load_surface
 from palpate.material import PRESETS
-from palpate.reduction import discretise, fit_surface_output, hankel_optimal, reduce
+from palpate.reduction import hankel_optimal, reduce
 from palpate.reduction.balancing import balance
 from palpate.reduction.block_form import diagonalise
 from palpate.reduction.evidence import hinf_error, in_band_error
@@ -37,7 +35,6 @@ def static_error(full, reduced):
     return in_band_error(full, reduced, np.zeros(1))
 
 
-@pytest.mark.slow
 def test_balanced_truncation_of_the_cube_with_a_thousand_nodes_is_below_one_percent_at_order_200():
     _, full = cube(10, conservative)
     assert full.n_states == 8067
@@ -51,6 +48,10 @@ def test_balanced_truncation_of_the_cube_with_a_thousand_nodes_is_below_one_perc
         assert errors[order] <= reduction.error_bound / largest
     assert errors[200] < 0.01
     assert errors[200] < errors[120]
+    # What the criterion hides, and the file states beside it: the hand feels ten times that error.
+    band = band_frequencies((full, reduction.system), (0.0, 0.4))
+    assert errors[200] < in_band_error(full, reduction.system, band) < 0.05
+    assert errors[200] < static_error(full, reduction.system) < 0.05
 
 
 @pytest.mark.slow
@@ -93,35 +94,46 @@ def test_the_collocated_cube_reduces_to_stable_models_inside_the_bound():
     assert reduced.n_states < 60
 
 
-@pytest.mark.slow
-def test_band_limited_truncation_of_the_liver_is_within_two_percent_at_order_120():
-    material = PRESETS["liver"]
-    with resources.as_file(resources.files("palpate_configs") / "liver.ply") as path:
-        surface = load_surface(path)
-    point, radius, band_hz = (0.02, -0.07, 0.0), 0.005, (0.0, 30.0)
-    center = contact_patch(point, 0.02, fill_surface(surface, 0.03)).center_m
-    cloud = fill_surface(surface, 0.0125, (Refinement(tuple(center), radius, 0.003, rings=True),))
-    back = nodes_in(PlaneRegion((0, 0.07, 0), (0, 1, 0)), cloud)
-    tip = contact_patch(point, radius, cloud)
-    assert len(tip.nodes) > 10
-    modes = conservative.elastic_modes(cloud, material, back, [tip.nodes])
-    full = viscoelastic_system(modes, material.prony)
-    assert full.n_states > 10_000
-    reduction = reduce(full, "tbr-band", order=120, band_hz=band_hz)
-    assert in_band_error(full, reduction.system, band_frequencies((full, reduction.system), band_hz)) < 0.02
-    assert static_error(full, reduction.system) < 0.02
-    plain = reduce(full, "tbr", order=120).system
-    assert static_error(full, plain) > 1  # why band-limited balancing is the default for organs
+def liver(**changes):
+    """The shipped scene, with entries of its tables replaced: {"table.key": value}."""
+    folder = Path(__file__).parents[2] / "configs"
+    tables = load_config(folder / "liver.toml").model_dump(mode="json", exclude_none=True)
+    for key, value in changes.items():
+        table, _, entry = key.partition("__")
+        (tables[table][0] if table == "contact" else tables[table])[entry] = value
+    return check_config(tables, "liver"), folder
 
-    boundary = np.flatnonzero(cloud.boundary)
-    rows = (3 * boundary[:, None] + np.arange(3)).ravel()
-    displacement = fit_surface_output(
-        modes,
-        material.prony,
-        modes.shapes[rows],
-        modes.patch_shapes[rows],
-        discretise(reduction.state_space, 1e-3),
-        period_s=1e-3,
-        band_hz=band_hz,
-    )
-    assert displacement.error_in_band < 0.25
+
+def test_a_coarse_liver_is_within_two_percent_at_order_120():
+    config, folder = liver(geometry__spacing_m=0.02, contact__radius_m=0.012, contact__spacing_m=0.008)
+    evidence = build_model(config, folder, Silent()).evidence
+    assert evidence.error_in_band < 0.02
+    assert evidence.error_static < 0.02
+
+
+@pytest.mark.slow
+def test_the_shipped_liver_is_within_two_percent_at_order_120_and_plain_balancing_is_useless_for_it():
+    config, folder = liver()
+    assert config.reduction.method == "tbr-band"
+    assert config.reduction.order == 120
+    model = build_model(config, folder, Silent())
+    assert model.n_nodes >= 1000
+    assert model.contacts[0].n_nodes >= 19
+    assert model.evidence.error_in_band < 0.02
+    assert model.evidence.error_static < 0.02
+    assert model.evidence.error_surface_in_band < 0.25
+    assert model.evidence.passive_up_to_hz > 10 * config.reduction.band_hz[1]
+    full = full_system(model.full)
+    plain = reduce(full, "tbr", order=120)
+    assert static_error(full, plain.system) > 1  # why band-limited balancing is the default for organs
+    assert hinf_error(full, plain.system) <= plain.error_bound / np.linalg.norm(full.d, 2)
+
+
+class Silent:
+    """Progress that nobody watches."""
+
+    def __call__(self, name):
+        pass
+
+    def note(self, text):
+        pass
