@@ -3,7 +3,9 @@
 Needs `eclipse-zenoh` and `msgpack`. In another language the same few calls of zenoh-c, zenoh-cpp or zenoh-pico do it.
 """
 
+import argparse
 import json
+import math
 import threading
 import time
 import uuid
@@ -36,7 +38,8 @@ class Connection:
         try:
             self.zenoh = zenoh.open(_configuration(endpoint, zenoh_config))
         except zenoh.ZError as error:
-            raise ServerGone(f"nothing answers at {zenoh_config or endpoint}: {error}") from error
+            cause = str(error).partition(" at /")[0]  # what follows is a place in Zenoh's own source
+            raise ServerGone(f"nothing answers at {zenoh_config or endpoint}: {cause}") from error
         try:
             self._join()
         except BaseException:
@@ -149,3 +152,14 @@ def _configuration(endpoint, zenoh_config):
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def positive(text):
+    """A number above 0 from the command line."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value

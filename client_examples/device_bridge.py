@@ -11,7 +11,7 @@ import sys
 import time
 
 import zenoh
-from connection import Connection, Refused, ServerGone
+from connection import Connection, Refused, ServerGone, positive
 from contract import Contract
 
 
@@ -47,6 +47,8 @@ def main():
     except (Refused, ServerGone) as error:
         print(f"device bridge: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:  # the server lets the force fade as soon as our token is gone
+        return 130
 
 
 def run(connection, options):
@@ -137,21 +139,21 @@ def parse_options():
         "--zenoh-config", metavar="FILE", help="Zenoh configuration to use instead of --connect"
     )
     parser.add_argument("--device", default="generic", help="profile whose limits are to hold (%(default)s)")
-    parser.add_argument("--mass-kg", type=float, default=0.1, help="of the handle (%(default)s)")
-    parser.add_argument("--damping-n-s-per-m", type=float, default=0.5, help="of the device (%(default)s)")
+    parser.add_argument("--mass-kg", type=positive, default=0.1, help="of the handle (%(default)s)")
+    parser.add_argument("--damping-n-s-per-m", type=positive, default=0.5, help="of the device (%(default)s)")
     parser.add_argument(
-        "--hand-n-per-m", type=float, default=100.0, help="how stiffly the hand holds it (%(default)s)"
+        "--hand-n-per-m", type=positive, default=100.0, help="how stiffly the hand holds it (%(default)s)"
     )
     parser.add_argument(
-        "--reach-m", type=float, default=0.01, help="how deep the hand wants to go (%(default)s)"
+        "--reach-m", type=positive, default=0.01, help="how deep the hand wants to go (%(default)s)"
     )
     parser.add_argument(
         "--silence-s",
-        type=float,
+        type=positive,
         default=0.1,
         help="without a force for so long, let go: a device must not be left with an old one (%(default)s s)",
     )
-    parser.add_argument("--duration-s", type=float, default=5.0, help="(%(default)s)")
+    parser.add_argument("--duration-s", type=positive, default=5.0, help="(%(default)s)")
     return parser.parse_args()
 
 

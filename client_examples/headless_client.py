@@ -1,6 +1,6 @@
 """Poke a served model without a device: drive one contact, check every force, print what it was like.
 
-Exit code 0: all well. 1: the contract was broken or the server went away. 2: it could not start.
+Exit code 0: all well. 1: the contract was broken or the server went away. 2: it could not start. 130: Ctrl-C.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import zenoh
-from connection import Connection, Refused, ServerGone
+from connection import Connection, Refused, ServerGone, positive
 from contract import Contract
 
 
@@ -24,12 +24,14 @@ def main():
     try:
         with Connection(options.connect, options.session, options.zenoh_config) as connection:
             return run(connection, options)
-    except (Refused, ServerGone) as error:
+    except (Refused, ServerGone, OSError) as error:
         print(f"palpate client: {error}", file=sys.stderr)
         return 2
 
 
 def run(connection, options):
+    if options.record:
+        Path(options.record).touch()  # better to fail now than after the poke
     contact = choose_contact(connection.description, options.contact)
     contract = Contract(connection.description, contact["name"])
     recording = []
@@ -43,7 +45,11 @@ def run(connection, options):
 
     connection.on_force(on_force)
     contract.agree(connection.acquire([contact["name"]]))
-    lost = drive(connection, contract, contact, motion(options), options, last_force)
+    interrupted = False
+    try:
+        lost = drive(connection, contract, contact, motion(options), options, last_force)
+    except KeyboardInterrupt:
+        lost, interrupted = None, True
     if not lost:
         time.sleep(0.05)  # the last answers are still under way
         connection.release()
@@ -62,6 +68,8 @@ def run(connection, options):
         print(f"contract broken: {line}", file=sys.stderr)
     if lost:
         print(f"palpate client: {lost}", file=sys.stderr)
+    if interrupted:
+        return 130
     return 0 if contract_holds else 1
 
 
@@ -185,13 +193,6 @@ def parse_options():
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     return parser.parse_args()
-
-
-def positive(text):
-    value = float(text)
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
-    return value
 
 
 if __name__ == "__main__":

@@ -324,7 +324,11 @@ def _assemble(arrays: dict[str, NDArray[Any]]) -> ReducedModel:
         n_vertices = _count(arrays, "surface_vertices")
         n_triangles = _count(arrays, "surface_triangles")
         n_poles = _count(arrays, "full_poles")
-        evidence_fields = {k: _numbers(k, v) for k, v in scalars["evidence"].items()}
+        expected = [f.name for f in fields(Evidence) if f.name != "hankel_singular_values"]
+        missing = [name for name in expected if name not in scalars["evidence"]]
+        if missing:
+            raise ModelFileError(f"field 'evidence.{missing[0]}' is missing")
+        evidence_fields = {name: _numbers(name, scalars["evidence"][name]) for name in expected}
         model = ReducedModel(
             name=str(scalars["name"]),
             method=str(scalars["method"]),
