@@ -43,7 +43,7 @@ def main() -> None:
         bare, palpate = [], []
         for run in range(options.runs):
             bare.append(ping_pong(command_bytes, force_bytes, options.seconds))
-            palpate.append(through_a_model(path, contact, options.seconds)[0])
+            palpate.append(through_a_model(path, contact, options.seconds, viewer=False)[0])
             print(f"run {run}: ping/pong {describe(bare[-1])}; palpate {describe(palpate[-1])}", flush=True)
         for name in ("p50_s", "p99_s"):
             b, p = (statistics.median(getattr(r, name) for r in results) for results in (bare, palpate))

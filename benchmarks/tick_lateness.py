@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     options = parser.parse_args()
     fifo = may_use_fifo()
-    print(f"scheduling policy: {'FIFO ' + str(realtime.PRIORITY) if fifo else 'OTHER'}")
+    print(f"scheduling policy: {'FIFO ' + str(realtime.LOOP_PRIORITY) if fifo else 'OTHER'}")
     ours, floor = [], []
     with tempfile.TemporaryDirectory() as folder:
         path = options.model or Path(folder) / "sample.npz"
@@ -73,7 +73,7 @@ def measure(
     output = folder / "cyclictest.txt"  # more text than a pipe holds
     bare = cyclictest(seconds, fifo, output)
     try:
-        _, status = through_a_model(path, contact, seconds)
+        _, status = through_a_model(path, contact, seconds, viewer=True)
     finally:
         bare.wait()
     return status, read_histogram(output.read_text())
@@ -85,7 +85,7 @@ def cyclictest(seconds: float, fifo: bool, output: Path) -> subprocess.Popen[str
     )
     if program is None:
         raise SystemExit("cyclictest is not installed (Debian: apt install rt-tests)")
-    policy = ["-p", str(realtime.PRIORITY)] if fifo else ["--policy=other"]
+    policy = ["-p", str(realtime.LOOP_PRIORITY)] if fifo else ["--policy=other"]
     command = [program, "-q", "-m", "-t1", "-i1000", "-D", str(int(seconds)), "-h", "20000", *policy]
     with output.open("w") as file:
         return subprocess.Popen(command, stdout=file, stderr=subprocess.DEVNULL, text=True)

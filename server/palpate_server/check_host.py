@@ -180,7 +180,7 @@ def tick_run(seconds: float) -> list[Finding]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "sample.npz"
         save_model(spring_mass_model(n_modes=50), path)
-        trips, status = through_a_model(path, "tip", seconds)
+        trips, status = through_a_model(path, "tip", seconds, viewer=True)
     late = status["late_ticks"] / max(status["ticks"], 1)
     skipped = status["skipped_ticks"] / max(status["ticks"], 1)
     return [

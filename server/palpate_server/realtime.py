@@ -8,19 +8,22 @@ import os
 import resource
 import sys
 
-PRIORITY = 80  # of SCHED_FIFO, 1 to 99: above ordinary threads, below the kernel's own
+# Of SCHED_FIFO, 1 to 99: above ordinary threads, below the kernel's own. The thread that receives commands runs ticks too;
+# if an ordinary thread could interrupt it in the middle of one, the loop would have to wait for both.
+LOOP_PRIORITY = 80
+COMMAND_PRIORITY = 70
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # on fault: what is never touched needs no memory
 _SWITCH_INTERVAL_S = 1e-4  # after which a busy Python thread lets another one run
 
 
-def raise_priority() -> str | None:
+def raise_priority(priority: int = LOOP_PRIORITY) -> str | None:
     """Schedule the calling thread first in, first out; or say why not."""
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError as error:
         return (
             f"no real-time scheduling ({error.strerror}): expect late ticks on a busy machine; "
-            f"allow it with `ulimit -r {PRIORITY}` or the capability SYS_NICE"
+            f"allow it with `ulimit -r {LOOP_PRIORITY}` or the capability SYS_NICE"
         )
     return None
 

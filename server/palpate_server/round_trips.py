@@ -64,14 +64,20 @@ def pong(endpoint: str, size: int) -> None:
         threading.Event().wait()
 
 
-def through_a_model(path: Path, contact: str, seconds: float) -> tuple[RoundTrips, dict[str, Any]]:
-    """Against a server of its own for the model in `path`, driven at one contact; and that server's last status."""
+def through_a_model(
+    path: Path, contact: str, seconds: float, *, viewer: bool
+) -> tuple[RoundTrips, dict[str, Any]]:
+    """Against a server of its own for the model in `path`, driven at one contact; and that server's last status.
+
+    With `viewer` the surface is listened to as well, by the same process: more work for the server and for the client.
+    """
     endpoint = free_endpoint()
     command = [sys.executable, "-m", "palpate_server", str(path), "--listen", endpoint]
     keys = wire.Keys("main")
     statuses: list[dict[str, Any]] = []
     with running(command, "serving"), transport.connect_session(endpoint, None) as session:
-        session.declare_subscriber(keys.surface, lambda sample: None)  # a viewer belongs to a server at work
+        if viewer:
+            session.declare_subscriber(keys.surface, lambda sample: None)
         session.declare_subscriber(
             keys.status, lambda sample: statuses.append(msgpack.unpackb(sample.payload.to_bytes()))
         )

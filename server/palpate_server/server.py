@@ -72,6 +72,7 @@ class Server:
             BlackBox(black_box, keys.session, self.names, self.memory) if black_box is not None else None
         )
         self._contact_index = {name: i for i, name in enumerate(self.names)}
+        self._command_thread_raised = False
         self._last_sequence = [-1] * len(self.names)
         self._state = "running"
         self._undisturbed_since_tick = (
@@ -151,6 +152,11 @@ class Server:
     def _on_command(self, sample: zenoh.Sample) -> None:
         """Runs on Zenoh's thread for every command: hand it over, and tick if it is time."""
         arrival_ns = time.monotonic_ns()
+        if not self._command_thread_raised:
+            self._command_thread_raised = True
+            realtime.raise_priority(
+                realtime.COMMAND_PRIORITY
+            )  # whether it may has been said by the loop's thread
         messages = self.messages
         payload = sample.payload
         try:

@@ -146,24 +146,31 @@ def decode_command(payload: bytes) -> Command:
 
 def read_command(message: Mapping[str, Any]) -> Command:
     """The tool command in a decoded map. Raises MalformedMessage."""
-    displacement = _vectors(message, "displacement_m")
+    try:
+        sequence, client_time_ns = message["sequence"], message["client_time_ns"]
+        displacement = _vectors("displacement_m", message["displacement_m"])
+    except KeyError as error:
+        raise MalformedMessage("missing_field", f"{error.args[0]} is missing") from None
     if not displacement:
         raise MalformedMessage("wrong_shape", "displacement_m is empty: expected at least one contact")
     velocity = dict.fromkeys(displacement, STILL)
     if "velocity_m_per_s" in message:
-        given = _vectors(message, "velocity_m_per_s")
+        given = _vectors("velocity_m_per_s", message["velocity_m_per_s"])
         if not given.keys() <= displacement.keys():
             raise MalformedMessage(
                 "wrong_shape", "velocity_m_per_s names contacts that displacement_m does not"
             )
         velocity |= given
-    return Command(
-        sequence=_count(message, "sequence"),
-        client_time_ns=_count(message, "client_time_ns"),
-        displacement_m=displacement,
-        velocity_m_per_s=velocity,
-        rendered_tick=_count(message, "rendered_tick") if "rendered_tick" in message else -1,
-    )
+    rendered_tick = message.get("rendered_tick", 0)
+    for name, value in (
+        ("sequence", sequence),
+        ("client_time_ns", client_time_ns),
+        ("rendered_tick", rendered_tick),
+    ):
+        if type(value) is not int or not 0 <= value <= _MAX_INT64:
+            raise MalformedMessage("wrong_type", f"{name} is {value!r}: expected an integer, 0 to 2^63 - 1")
+    told = "rendered_tick" in message
+    return Command(sequence, client_time_ns, displacement, velocity, rendered_tick if told else -1)
 
 
 def is_finite(command: Command) -> bool:
@@ -275,38 +282,18 @@ def encode_geometry(vertices: NDArray[np.float64], triangles: NDArray[np.int32])
     )
 
 
-def _field(message: Mapping[str, Any], name: str, expected: type) -> Any:
-    try:
-        value = message[name]
-    except KeyError:
-        raise MalformedMessage("missing_field", f"{name} is missing") from None
-    if type(value) is not expected:
-        raise MalformedMessage(
-            "wrong_type", f"{name} is a {type(value).__name__}: expected {expected.__name__}"
-        )
-    return value
-
-
-def _count(message: Mapping[str, Any], name: str) -> int:
-    value = _field(message, name, int)
-    if not 0 <= value <= _MAX_INT64:
-        raise MalformedMessage("wrong_type", f"{name} is {value}: expected 0 to 2^63 - 1")
-    return int(value)
-
-
-def _vectors(message: Mapping[str, Any], field: str) -> dict[str, Vector]:
-    return {name: _vector(field, name, value) for name, value in _field(message, field, dict).items()}
-
-
-def _vector(field: str, name: object, value: object) -> Vector:
-    if type(value) is not list or len(value) != 3:
-        raise MalformedMessage("wrong_shape", f"{field} of {name!r}: expected 3 numbers")
-    x, y, z = value
-    if type(x) is float and type(y) is float and type(z) is float:
-        return x, y, z
-    for number in value:
-        if type(number) is not float and type(number) is not int:
-            raise MalformedMessage(
-                "wrong_type", f"{field} of {name!r} holds a {type(number).__name__}: expected numbers"
-            )
-    return float(x), float(y), float(z)
+def _vectors(field: str, value: object) -> dict[str, Vector]:
+    if type(value) is not dict:
+        raise MalformedMessage("wrong_type", f"{field} is a {type(value).__name__}: expected a map")
+    vectors: dict[str, Vector] = {}
+    for name, vector in value.items():
+        if type(vector) is not list or len(vector) != 3:
+            raise MalformedMessage("wrong_shape", f"{field} of {name!r}: expected 3 numbers")
+        x, y, z = vector
+        if type(x) is float and type(y) is float and type(z) is float:
+            vectors[name] = x, y, z
+        elif all(type(number) is float or type(number) is int for number in vector):
+            vectors[name] = float(x), float(y), float(z)
+        else:
+            raise MalformedMessage("wrong_type", f"{field} of {name!r} is {vector!r}: expected numbers")
+    return vectors
