@@ -29,7 +29,8 @@ app = typer.Typer(
 console = Console()
 errors = Console(stderr=True)
 
-PASS_THROUGH = {"allow_extra_args": True, "ignore_unknown_options": True}
+# Options, --help among them, go to the program that is started.
+PASS_THROUGH = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 
 def main() -> None:
@@ -127,20 +128,37 @@ def inspect(
         print_evidence(loaded)
 
 
-@app.command(context_settings={**PASS_THROUGH, "help_option_names": []})
+@app.command(context_settings=PASS_THROUGH)
 def serve(context: typer.Context) -> None:
     """Run a model file at 1 kHz over Zenoh (`palpate serve --help` for its options)."""
-    # A process of its own, without the offline stage's libraries: the loop shares nothing with them.
-    os.execv(sys.executable, [sys.executable, "-m", "palpate_server", *context.args])
+    _run_server_tool("palpate_server", context.args)
 
 
-@app.command(context_settings={**PASS_THROUGH, "help_option_names": []})
+@app.command(context_settings=PASS_THROUGH)
+def record(context: typer.Context) -> None:
+    """Record a running server's commands, forces and status to an MCAP file (`palpate record --help`)."""
+    _run_server_tool("palpate_server.record", context.args)
+
+
+@app.command(context_settings=PASS_THROUGH)
+def replay(context: typer.Context) -> None:
+    """Repeat a recording offline through a model and compare bit for bit (`palpate replay --help`)."""
+    _run_server_tool("palpate_server.replay", context.args)
+
+
+@app.command(name="check-host", context_settings=PASS_THROUGH)
+def check_host(context: typer.Context) -> None:
+    """Measure whether this machine can hold 1 kHz, and say what to change (`palpate check-host --help`)."""
+    _run_server_tool("palpate_server.check_host", context.args)
+
+
+@app.command(context_settings=PASS_THROUGH)
 def client(context: typer.Context) -> None:
     """Poke a running server and check every answer (`palpate client --help` for its options)."""
     _run_example("headless_client.py", context.args)
 
 
-@app.command(context_settings={**PASS_THROUGH, "help_option_names": []})
+@app.command(context_settings=PASS_THROUGH)
 def health(context: typer.Context) -> None:
     """Say whether a server is there and its loop runs (`palpate health --help` for its options)."""
     _run_example("health.py", context.args)
@@ -177,6 +195,11 @@ def reproduce(
         written = reproduce(figure or [], out, quick, report)
     for path in written:
         console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+def _run_server_tool(module: str, arguments: list[str]) -> None:
+    """Become a module of the server: a process of its own, so that the loop shares nothing with the offline stage."""
+    os.execv(sys.executable, [sys.executable, "-m", module, *arguments])
 
 
 def _run_example(name: str, arguments: list[str]) -> None:

@@ -157,6 +157,15 @@ def test_a_scene_that_makes_no_sense_is_refused_by_the_name_of_its_part(
     assert [p.name for p in tmp_path.iterdir()] == ["odd.toml"]
 
 
+@pytest.mark.parametrize("command", ["serve", "client", "health", "record", "replay", "check-host"])
+def test_programs_that_palpate_starts_show_their_own_help_under_its_name(
+    tmp_path: Path, command: str
+) -> None:
+    done = palpate(command, "--help", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"usage: palpate {command}")
+
+
 def test_a_scene_that_can_not_be_built_leaves_no_file(slab: tuple[Path, str], tmp_path: Path) -> None:
     elastic = SLAB.replace('preset = "liver"', 'preset = "liver"\ngamma = []\ntau_s = []')
     (tmp_path / "elastic.toml").write_text(elastic)
