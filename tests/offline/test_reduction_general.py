@@ -426,3 +426,75 @@ def test_matrices_that_do_not_fit_are_named():
         LinearSystem(-np.eye(2), np.ones((2, 1)), np.ones((1, 3)), np.ones((1, 1)))
     with pytest.raises(ValueError, match="a holds values that are not finite"):
         LinearSystem(np.full((2, 2), np.nan), np.ones((2, 1)), np.ones((1, 2)), np.ones((1, 1)))
+
+
+def empty(n_states, n_inputs, n_outputs):
+    """A system that does nothing: no input, no output, or nothing in B or C, by its shape."""
+    shapes = (n_states, n_inputs), (n_outputs, n_states), (n_outputs, n_inputs)
+    return LinearSystem(-np.diag(np.arange(1.0, n_states + 1)), *(np.zeros(shape) for shape in shapes))
+
+
+def with_fields(system, **fields):
+    return LinearSystem(**({name: getattr(system, name) for name in "abcde"} | fields))
+
+
+PASSING_NOTHING = {
+    "zero B": with_fields(SYSTEMS["two by two"], b=np.zeros((20, 2))),
+    "zero C": with_fields(SYSTEMS["two by two"], c=np.zeros((2, 20))),
+    "no states": LinearSystem(np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((3, 0)), np.ones((3, 2))),
+    "no inputs": empty(4, 0, 2),
+    "no outputs": empty(4, 2, 0),
+    "zero D as well": empty(4, 2, 2),
+}
+
+
+def band_limited(system, order=None, tolerance=None, **options):
+    return band_limited_truncation(system, (0.0, 1.0), order, tolerance, **options)
+
+
+@pytest.mark.parametrize("size", [{"order": 3}, {"tolerance": 1e-3}], ids=["order", "tolerance"])
+@pytest.mark.parametrize("method", [*BALANCING, band_limited])
+@pytest.mark.parametrize("name", PASSING_NOTHING)
+def test_a_system_whose_states_pass_nothing_on_reduces_to_its_d(name, method, size):
+    system = PASSING_NOTHING[name]
+    reduced = method(system, **size)
+    assert reduced.order == 0
+    assert np.array_equal(reduced.system.d, system.d)
+    assert reduced.error_bound in (0.0, None)
+
+
+@pytest.mark.parametrize("size", [{"order": 3}, {"tolerance": 1e-3}], ids=["order", "tolerance"])
+@pytest.mark.parametrize("method", [*WITH_BOUND, band_limited])
+def test_a_wholly_unstable_system_is_its_own_reduction_when_split(method, size):
+    growing = LinearSystem(np.diag([1.0, 2.0, 3.0]), np.ones((3, 1)), np.ones((1, 3)), np.ones((1, 1)))
+    reduced = method(growing, **size, unstable="split")
+    s = 1j * np.array([0.0, 1.0, 10.0])
+    assert reduced.order == 3
+    assert reduced.system.transfer(s) == pytest.approx(growing.transfer(s), rel=1e-12)
+
+
+@pytest.mark.parametrize("method", [*WITH_BOUND, band_limited])
+def test_an_order_that_is_no_whole_number_is_refused(method):
+    with pytest.raises(ValueError, match=r"order = 2\.5: expected a whole number"):
+        method(SYSTEMS["two by two"], 2.5)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"a": -1j * np.eye(20)}, "a holds values of type complex128: expected real"),
+        ({"a": scipy.sparse.csc_array(-1j * np.eye(20))}, "a holds values of type complex128: expected real"),
+        ({"e": np.eye(20, dtype=complex)}, "e holds values of type complex128"),
+        ({"d": np.zeros((2, 2), dtype=bool)}, "d holds values of type bool"),
+        ({"b": scipy.sparse.csc_array(np.ones((20, 2)))}, "b is a csc_array: expected a NumPy array"),
+        ({"c": [[1.0] * 20] * 2}, "c is a list: expected a NumPy array"),
+        ({"a": [[1.0]]}, "a is a list: expected a NumPy array or a SciPy sparse array"),
+        ({"a": None}, "a is a NoneType"),
+        ({"b": np.ones(20)}, r"b has shape \(20,\): expected a matrix"),
+        ({"c": np.ones((2, 20, 1))}, r"c has shape \(2, 20, 1\): expected a matrix"),
+        ({"a": scipy.sparse.lil_array(np.full((20, 20), np.inf))}, "a holds values that are not finite"),
+    ],
+)
+def test_a_field_that_is_no_real_matrix_of_the_right_kind_is_named(fields, message):
+    with pytest.raises(ValueError, match=message):
+        with_fields(SYSTEMS["two by two"], **fields)

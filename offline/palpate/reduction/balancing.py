@@ -74,8 +74,12 @@ class Balancing:
         return LinearSystem(w.T @ system.apply(t), w.T @ system.b, system.c @ t, system.d)
 
     def tail(self, order: int) -> float:
-        """Upper bound on the sum of all Hankel singular values beyond the first `order`."""
+        """The sum of all Hankel singular values beyond the first `order`, as sure as `Gramians.missing`."""
         return float(np.sum(self.sigma[order:])) + self.gramians.missing
+
+    def relative_to_largest(self, value: float) -> float:
+        """value / sigma_1; where no state is reached and seen, so that there is no sigma_1 above 0: 0."""
+        return value / float(self.sigma[0]) if self.rank else 0.0
 
 
 def balance(system: Realisation, gramians: Gramians) -> Balancing:

@@ -127,7 +127,7 @@ def band_controllability_factor(
     P = 1/(2 pi) times the integral over |omega| in the band of (j omega - A)^-1 B B^* (j omega - A)^-*, by
     `band_quadrature`; +-omega together give the real and the imaginary part of a column (Gawronski & Juang 1990).
     """
-    slowest = float(np.min(np.abs(system.poles)))
+    slowest = float(np.min(np.abs(system.poles), initial=band[1]))
     omega, weight = band_quadrature(band, slowest, n_frequencies)
     n, m = system.n_states, system.n_inputs
     form = real_form(system)
@@ -141,7 +141,7 @@ def band_controllability_factor(
         single = form.partner == np.arange(n)
         x[single] = form.b[single] * (scale / shift[single])[:, None]
         columns[:, i, 0], columns[:, i, 1] = x.real, x.imag
-    return columns.reshape(n, -1)
+    return columns.reshape(n, 2 * m * len(omega))
 
 
 def band_quadrature(band: tuple[float, float], slowest: float, n_points: int) -> tuple[Array, Array]:

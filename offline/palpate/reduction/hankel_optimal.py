@@ -45,6 +45,10 @@ def hankel_optimal(
     part = prepare(system, order, tolerance, unstable)
     balancing = balance(part.realisation, part.gramians())
     sigma = balancing.sigma
+    if balancing.rank == 0:
+        return part.result(
+            "Hankel-optimal", balancing.truncated(part.realisation, 0), sigma, 2 * balancing.tail(0)
+        )
     lossless = int(np.count_nonzero(sigma > _LOSSLESS * sigma[0]))
     largest_order = int(np.count_nonzero(sigma > _LEAST * sigma[0])) - 1
     r = part.chosen_order(largest_order, lambda k: float(sigma[k] / sigma[0]))

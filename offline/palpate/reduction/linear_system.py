@@ -25,7 +25,8 @@ class LinearSystem:
     b  (n, n_inputs), c (n_outputs, n), d (n_outputs, n_inputs), dense
     e  (n, n), regular, dense or scipy sparse; None for the identity
 
-    Raises ValueError where the shapes do not fit or a value is not finite.
+    Raises ValueError where a field is no such matrix, is not real, does not fit the others or has a value that is not
+    finite.
     """
 
     a: Matrix
@@ -35,6 +36,8 @@ class LinearSystem:
     e: Matrix | None = None
 
     def __post_init__(self) -> None:
+        for name in ("a", "b", "c", "d", "e"):
+            _check_matrix(name, getattr(self, name))
         n, m, p = self.a.shape[0], self.b.shape[1], self.c.shape[0]
         expected = {"a": (n, n), "b": (n, m), "c": (p, n), "d": (p, m), "e": (n, n)}
         for name, shape in expected.items():
@@ -43,7 +46,7 @@ class LinearSystem:
                 continue
             if value.shape != shape:
                 raise ValueError(f"{name} has shape {value.shape}: expected {shape}")
-            entries = value.data if _is_sparse(value) else value
+            entries = value.tocoo().data if _is_sparse(value) else value
             if not np.all(np.isfinite(entries)):
                 raise ValueError(f"{name} holds values that are not finite")
 
@@ -128,6 +131,19 @@ class LinearSystem:
         for i, point in enumerate(s):
             out[i] = basis @ scipy.linalg.solve_triangular(point * identity - triangle, rhs)
         return out
+
+
+def _check_matrix(name: str, value: Any) -> None:
+    if name == "e" and value is None:
+        return
+    may_be_sparse = name in ("a", "e")
+    if not (isinstance(value, np.ndarray) or (may_be_sparse and _is_sparse(value))):
+        expected = "a NumPy array or a SciPy sparse array" if may_be_sparse else "a NumPy array"
+        raise ValueError(f"{name} is a {type(value).__name__}: expected {expected}")
+    if value.ndim != 2:
+        raise ValueError(f"{name} has shape {value.shape}: expected a matrix")
+    if value.dtype.kind not in "fiu":
+        raise ValueError(f"{name} holds values of type {value.dtype}: expected real numbers")
 
 
 def _is_sparse(matrix: Matrix) -> bool:

@@ -137,8 +137,8 @@ def _continuous(system: DiagonalSystem, omega: Array) -> NDArray[np.complex128]:
 def _check_arguments(order: int | None, tolerance: float | None) -> None:
     if (order is None) == (tolerance is None):
         raise ValueError(f"order = {order} and tolerance = {tolerance}: expected exactly one of them")
-    if order is not None and order < 1:
-        raise ValueError(f"order = {order}: expected at least 1")
+    if order is not None and not (isinstance(order, int | np.integer) and order >= 1):
+        raise ValueError(f"order = {order!r}: expected a whole number of states, at least 1")
     if tolerance is not None and not 0 < tolerance < math.inf:
         raise ValueError(f"tolerance = {tolerance}: expected a number above 0")
 

@@ -80,7 +80,7 @@ def balanced_truncation(
     """
     part = prepare(system, order, tolerance, unstable)
     balancing = balance(part.realisation, part.gramians())
-    r = part.chosen_order(balancing.rank, lambda k: 2 * balancing.tail(k) / balancing.sigma[0])
+    r = part.chosen_order(balancing.rank, lambda k: balancing.relative_to_largest(2 * balancing.tail(k)))
     reduced = balancing.truncated(part.realisation, r)
     return part.result("balanced truncation", reduced, balancing.sigma, 2 * balancing.tail(r))
 
@@ -99,7 +99,7 @@ def singular_perturbation_balancing(
     part = prepare(system, order, tolerance, unstable)
     balancing = balance(part.realisation, part.gramians())
     full = balancing.truncated(part.realisation, balancing.rank)
-    r = part.chosen_order(balancing.rank, lambda k: 2 * balancing.tail(k) / balancing.sigma[0])
+    r = part.chosen_order(balancing.rank, lambda k: balancing.relative_to_largest(2 * balancing.tail(k)))
     a, b, c = full.a, full.b, full.c
     fast = np.linalg.solve(a[r:, r:], np.hstack([a[r:, :r], b[r:]]))
     reduced = LinearSystem(
@@ -246,6 +246,8 @@ def prepare(system: System, order: int | None, tolerance: float | None, unstable
         raise ValueError(f"order = {order} and tolerance = {tolerance}: expected exactly one of them")
     if tolerance is not None and not 0 < tolerance < math.inf:
         raise ValueError(f"tolerance = {tolerance}: expected a number above 0")
+    if order is not None and not isinstance(order, int | np.integer):
+        raise ValueError(f"order = {order!r}: expected a whole number of states")
     if unstable not in ("refuse", "split"):
         raise ValueError(f"unstable = {unstable!r}: expected 'refuse' or 'split'")
     stable, rest = _stable_part(system, unstable)
@@ -280,11 +282,11 @@ def _band_factor(system: System, band: tuple[float, float]) -> Array:
     """(n, k): factor of the controllability Gramian limited to the band (rad/s), by quadrature over the frequency."""
     if isinstance(system, DiagonalSystem):
         return band_controllability_factor(system, band, _BAND_FREQUENCIES)
-    slowest = band[1] / 1000 if system.is_sparse else float(np.min(np.abs(system.poles)))
+    slowest = band[1] / 1000 if system.is_sparse else float(np.min(np.abs(system.poles), initial=band[1]))
     omega, weight = band_quadrature(band, slowest, _BAND_FREQUENCIES)
     columns = system.solutions(1j * omega) * np.sqrt(weight / np.pi)[:, None, None]
     stacked = np.concatenate([columns.real, columns.imag])
-    return stacked.transpose(1, 0, 2).reshape(system.n_states, -1)
+    return stacked.transpose(1, 0, 2).reshape(system.n_states, len(stacked) * system.n_inputs)
 
 
 def _smallest_in_band(
@@ -294,6 +296,8 @@ def _smallest_in_band(
     band_hz: tuple[float, float],
     tolerance: float,
 ) -> int:
+    if balancing.rank == 0:
+        return 0  # the response is D in the whole band
     lossless = balancing.truncated(realisation, balancing.rank)
     omega = frequencies_near(system.poles if isinstance(system, DiagonalSystem) else lossless.poles, band_hz)
     full = system.transfer(1j * omega)
