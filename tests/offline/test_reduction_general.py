@@ -498,3 +498,71 @@ def test_an_order_that_is_no_whole_number_is_refused(method):
 def test_a_field_that_is_no_real_matrix_of_the_right_kind_is_named(fields, message):
     with pytest.raises(ValueError, match=message):
         with_fields(SYSTEMS["two by two"], **fields)
+
+
+@pytest.fixture
+def low_rank_above_twenty_states(monkeypatch):
+    monkeypatch.setattr("palpate.reduction.truncation.DENSE_STATES", 20)
+
+
+def heated_rod_beside(block):
+    """Sparse: the heat equation on 60 points, poles -10 to -15,000 1/s, and beside it a block of its own."""
+    rod = scipy.sparse.diags_array([1.0, -2.0, 1.0], offsets=(-1, 0, 1), shape=(60, 60)) * 61**2
+    a = scipy.sparse.csc_array(scipy.sparse.block_diag([rod, np.array(block)]))
+    b = np.zeros((a.shape[0], 1))
+    b[20], b[60:] = 1, 1
+    return LinearSystem(a, b, np.ascontiguousarray(b.T), np.zeros((1, 1)))
+
+
+UNSTABLE_BLOCKS = {
+    "among the fast poles": [[500.0]],
+    "faster than all": [[1e6]],
+    "slow": [[1e-3]],
+    "an integrator": [[0.0]],
+    "undamped": [[0.0, 50.0], [-50.0, 0.0]],
+    "a growing oscillation": [[30.0, 2000.0], [-2000.0, 30.0]],
+}
+
+
+@pytest.mark.usefixtures("low_rank_above_twenty_states")
+@pytest.mark.parametrize("method", [*WITH_BOUND, band_limited])
+@pytest.mark.parametrize("name", UNSTABLE_BLOCKS)
+def test_a_large_sparse_system_that_is_not_stable_is_refused(name, method):
+    system = heated_rod_beside(UNSTABLE_BLOCKS[name])
+    with pytest.raises(ReductionError, match="not stable"):
+        method(system, 5)
+    if method is modal_truncation:  # dense all the same
+        s = 1j * np.array([1.0, 100.0])
+        reduced = method(system, 50, unstable="split")
+        error = np.max(np.abs(reduced.system.transfer(s) - system.transfer(s)))
+        assert error <= reduced.error_bound
+    else:
+        with pytest.raises(ReductionError, match="expected a dense one, or at most 20 states"):
+            method(system, 5, unstable="split")
+
+
+@pytest.mark.parametrize("pole", [500.0, 1e-3, 1e6])
+def test_the_low_rank_iteration_itself_does_not_converge_for_an_unstable_system(pole):
+    system = heated_rod_beside([[pole]])
+    with pytest.raises(NotConvergedError, match="not stable"):
+        low_rank_factor(system.a, None, system.b)
+
+
+@pytest.mark.usefixtures("low_rank_above_twenty_states")
+@pytest.mark.parametrize("method", [*BALANCING, band_limited])
+@pytest.mark.parametrize("size", [{"order": 3}, {"tolerance": 1e-3}], ids=["order", "tolerance"])
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"b": np.zeros((61, 1))},
+        {"c": np.zeros((1, 61))},
+        {"b": np.zeros((61, 0)), "d": np.zeros((1, 0))},
+        {"c": np.zeros((0, 61)), "d": np.zeros((0, 1))},
+    ],
+    ids=["zero B", "zero C", "no inputs", "no outputs"],
+)
+def test_a_large_sparse_system_that_passes_nothing_on_reduces_to_its_d(fields, size, method):
+    system = with_fields(heated_rod_beside([[-1.0]]), **fields)
+    reduced = method(system, **size)
+    assert reduced.order == 0
+    assert reduced.error_bound in (0.0, None)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs, splu
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -109,6 +109,35 @@ class LinearSystem:
     def pole_round_off(self) -> float:
         """What the real parts of the poles are uncertain by at least, 1/s: a pole nearer to the axis may lie on it."""
         return 1e-13 * float(np.max(np.abs(self.poles), initial=0.0))
+
+    def outlying_poles(self) -> Complex:
+        """(k,): of a sparse system a few poles nearest to 0, and those of positive real part that stand out.
+
+        Arnoldi iteration on A^-1 E, whose eigenvalues 1/p have their largest moduli and, where a pole p is not stable,
+        their largest real parts there. What does not converge in a few hundred solutions is left out, so this finds
+        unstable poles but does not prove that there are none. 0 alone where A is singular.
+        """
+        n = self.n_states
+        try:
+            factor = splu(sparse.csc_array(self.a))
+        except RuntimeError:
+            return np.zeros(1, dtype=np.complex128)
+        operator = LinearOperator((n, n), lambda x: factor.solve(self.mass(x)), dtype=np.float64)
+        start = np.random.default_rng(0).standard_normal(n)
+        searches: tuple[tuple[Literal["LM", "LR"], int], ...] = (("LM", 10), ("LR", 2))
+        found: list[NDArray[Any]] = []
+        for which, k in searches:
+            try:
+                found.append(
+                    eigs(operator, k, which=which, v0=start, ncv=40, maxiter=10, return_eigenvectors=False)
+                )
+            except ArpackNoConvergence as partial:
+                found.append(partial.eigenvalues)
+        inverse = np.concatenate(found).astype(np.complex128)
+        known = np.abs(inverse) > 1e-10 * np.max(
+            np.abs(inverse), initial=0.0
+        )  # smaller ones are round-off in part
+        return 1 / inverse[known]
 
     def transfer(self, s: NDArray[np.complexfloating[Any, Any]]) -> Complex:
         """(n_points, n_outputs, n_inputs): C (s E - A)^-1 B + D at the points s (n_points,)."""

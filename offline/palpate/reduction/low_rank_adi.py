@@ -26,15 +26,23 @@ def low_rank_factor(a: Any, e: Any, b: Array, tolerance: float = 1e-12, max_colu
     Li & White 2002 in residual form, pairs of complex shifts in real arithmetic (Benner, Kuerschner & Saak 2013),
     shifts from projections on the newest columns (Benner, Kuerschner & Saak 2014).
 
-    Raises NotConvergedError beyond max_columns.
+    Raises NotConvergedError beyond max_columns, and where A + shift E is singular or the residual grows beyond
+    recovery, which a system that is not stable makes it do: the factors of its iteration have moduli above 1.
     """
+    if not np.any(b):
+        return np.zeros((len(b), 0))
     e = sparse.eye_array(len(b)) if e is None else e
     w = np.array(b, dtype=np.float64)
     goal = tolerance * float(np.linalg.norm(w.T @ w, 2))
     blocks: list[Array] = []
     n_columns = 0
     shifts = list(_projection_shifts(a, e, w))
-    while goal > 0 and (residual := float(np.linalg.norm(w.T @ w, 2))) > goal:
+    while (residual := float(np.linalg.norm(w.T @ w, 2))) > goal:
+        if residual * np.finfo(float).eps ** 2 > goal:  # the residual's round-off alone exceeds what is asked
+            raise NotConvergedError(
+                f"the low-rank iteration grew to {residual / goal * tolerance:.1e} of its start, expected to fall to "
+                f"{tolerance:.1e}: the system is not stable or far from normal, use a dense matrix"
+            )
         if n_columns > max_columns:
             raise NotConvergedError(
                 f"the low-rank iteration stands at {residual / goal * tolerance:.1e} of its start after {n_columns} "
@@ -44,7 +52,13 @@ def low_rank_factor(a: Any, e: Any, b: Array, tolerance: float = 1e-12, max_colu
             newest = np.hstack(blocks[-8:])
             shifts = list(_projection_shifts(a, e, newest)) or list(_projection_shifts(a, e, w))
         shift = shifts.pop(0)
-        v = splu(sparse.csc_array(a + shift * e)).solve(w.astype(type(shift)))
+        try:
+            v = splu(sparse.csc_array(a + shift * e)).solve(w.astype(type(shift)))
+        except RuntimeError as error:
+            raise NotConvergedError(
+                f"A + shift E is singular for the shift {shift:.6g} 1/s: the system is not stable, it has a pole at the "
+                "shift's negative"
+            ) from error
         if isinstance(shift, complex):
             gamma, delta = 2 * np.sqrt(-shift.real), shift.real / shift.imag
             combined = v.real + delta * v.imag
@@ -54,7 +68,7 @@ def low_rank_factor(a: Any, e: Any, b: Array, tolerance: float = 1e-12, max_colu
             blocks.append(np.sqrt(-2 * shift) * v)
             w = w - 2 * shift * (e @ v)
         n_columns = sum(block.shape[1] for block in blocks)
-    return np.hstack(blocks) if blocks else np.zeros((len(b), 0))
+    return np.hstack(blocks)
 
 
 def _projection_shifts(a: Any, e: Any, columns: Array) -> list[float | complex]:

@@ -41,6 +41,10 @@ DENSE_STATES = 2500
 """Sparse systems up to this many states are treated as dense: exact Gramians, whatever the damping."""
 
 _GRAMIAN_TOLERANCE = 1e-20
+
+_AXIS = 1e-12
+"""|Re p| / |p| below which a pole of a large sparse system may lie on the imaginary axis, by round-off."""
+
 _BAND_FREQUENCIES = 120
 
 
@@ -130,8 +134,9 @@ def band_limited_truncation(
     if not 0 <= band_hz[0] < band_hz[1] < math.inf:
         raise ValueError(f"band_hz = {band_hz}: expected (low, high) with 0 <= low < high")
     part = prepare(system, order, tolerance, unstable)
+    observe = part.gramians().observe  # first: it fails for a large sparse system that is not stable
     control = _band_factor(part.stable, (2 * math.pi * band_hz[0], 2 * math.pi * band_hz[1]))
-    balancing = balance(part.realisation, Gramians(control, part.gramians().observe))
+    balancing = balance(part.realisation, Gramians(control, observe))
     if order is None:
         r = _smallest_in_band(part.stable, part.realisation, balancing, band_hz, part.tolerance)
     else:
@@ -156,11 +161,12 @@ def modal_truncation(
     The bound is the sum of |c_k b_k^T| / |Re lambda_k| over the dropped poles, with and without their statics.
     Raises ReductionError where A has no well-conditioned basis of eigenvectors.
     """
+    if isinstance(system, LinearSystem):
+        system = system.explicit  # its eigenvectors are needed all the same, however large it is
     part = prepare(system, order, tolerance, unstable)
     stable = part.stable
     if isinstance(stable, LinearSystem):
-        dense = stable.explicit
-        stable = diagonalise(dense.a, dense.b, dense.c, dense.d)
+        stable = diagonalise(stable.a, stable.b, stable.c, stable.d)
     ascending = np.argsort(np.abs(stable.poles), kind="stable")
     stable = stable.take(ascending)
     sizes = np.where(stable.is_pair, 2, 1)
@@ -216,7 +222,8 @@ class Prepared:
             raise ReductionError(str(error)) from error
         sigma = np.linalg.svd(observe.T @ stable.mass(control), compute_uv=False)
         # The singular values that the iteration has not seen count as the last that it has.
-        return Gramians(control, observe, float((stable.n_states - len(sigma)) * sigma[-1]))
+        last = float(sigma[-1]) if len(sigma) else 0.0
+        return Gramians(control, observe, (stable.n_states - len(sigma)) * last)
 
     def chosen_order(self, rank: int, relative_bound: Callable[[int], float]) -> int:
         """Order of the stable part: as asked but no larger than rank, or the first whose bound is in the tolerance."""
@@ -260,7 +267,7 @@ def prepare(system: System, order: int | None, tolerance: float | None, unstable
 def _stable_part(system: System, unstable: Unstable) -> tuple[System, LinearSystem | None]:
     if isinstance(system, LinearSystem):
         if system.is_sparse and system.n_states > DENSE_STATES:
-            return system, None  # its Gramians do not converge unless it is stable
+            return _large(system, unstable), None
         system = system.explicit
     abscissa = system.spectral_abscissa
     if abscissa < (-system.pole_round_off if isinstance(system, LinearSystem) else 0):
@@ -276,6 +283,23 @@ def _stable_part(system: System, unstable: Unstable) -> tuple[System, LinearSyst
     rest = real_form(system.take(~decaying))
     a = rest.apply(np.eye(len(rest.decay)))
     return system.take(decaying), LinearSystem(a, rest.b, rest.c, np.zeros_like(system.d))
+
+
+def _large(system: LinearSystem, unstable: Unstable) -> LinearSystem:
+    """The sparse system itself, no obvious pole of which is unstable: its low-rank Gramians are the proof."""
+    if unstable == "split":
+        raise ReductionError(
+            f"unstable = 'split' with a sparse system of {system.n_states} states: expected a dense one, or at most "
+            f"{DENSE_STATES} states"
+        )
+    poles = system.outlying_poles()
+    wrong = poles[~(poles.real < -_AXIS * np.abs(poles))]
+    if len(wrong):
+        raise ReductionError(
+            f"the system is not stable: it has a pole at {wrong[np.argmax(wrong.real)]:.6g} 1/s, expected real parts below "
+            "0 by more than round-off"
+        )
+    return system
 
 
 def _band_factor(system: System, band: tuple[float, float]) -> Array:
