@@ -97,14 +97,14 @@ def draw_touch(model: ReducedModel, touch: Touch, contact: int, path: Path) -> N
     axes[2].axhline(
         stated, color="tab:orange", linestyle="--", label=f"stated in-band error, {100 * stated:.2g} %"
     )
-    axes[2].set_ylim(1e-5, 1)
+    axes[2].set_ylim(1e-5, 10)
     axes[2].set_ylabel("force error over\nlargest force")
     axes[2].set_xlabel("time, s")
-    axes[2].legend(loc="lower center", ncols=3, frameon=False, fontsize="small")
+    axes[2].legend(loc="upper right", ncols=3, frameon=False, fontsize="small")
     for axis in axes:
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
-    right.suptitle("One poke through the 1 kHz server")
+    right.suptitle("What the client felt through the 1 kHz server")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -132,7 +132,7 @@ def _draw_body(figure: Any, model: ReducedModel, contact: int, displacement: Arr
     moved = 1e3 * np.linalg.norm(displacement, axis=1)
     per_triangle = moved[model.surface.triangles].mean(axis=1)
     top = max(float(moved.max()), 1e-9)
-    norm = LogNorm(vmin=1e-3 * top, vmax=top, clip=True)
+    norm = LogNorm(vmin=0.02 * top, vmax=top, clip=True)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     facing = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
     normal = np.asarray(patch.normal)
@@ -150,10 +150,14 @@ def _draw_body(figure: Any, model: ReducedModel, contact: int, displacement: Arr
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     for setter, a, b in zip((axis.set_xlim, axis.set_ylim, axis.set_zlim), low, high, strict=True):
         setter(a, b)
-    axis.set_box_aspect(high - low)
+    axis.set_box_aspect(high - low, zoom=1.3)
     elevation = np.degrees(np.arcsin(np.clip(normal[2], -1, 1)))
     azimuth = np.degrees(np.arctan2(normal[1], normal[0]))
     axis.view_init(elev=float(np.clip(elevation - 25, -60, 60)), azim=float(azimuth) + 35)
-    axis.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
-    axis.set_title(f"{model.name} at the deepest point, tool at '{patch.name}'")
-    figure.colorbar(mapper, ax=axis, shrink=0.6, pad=0.08, label="displacement, mm")
+    axis.set_axis_off()
+    size = " x ".join(f"{extent:.0f}" for extent in high - low)
+    axis.set_title(f"{model.name}, {size} mm, at the deepest point of the poke\ntool at '{patch.name}'")
+    bar = figure.colorbar(mapper, ax=axis, shrink=0.6, pad=0.02, label="displacement, mm", extend="min")
+    ticks = [t for t in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if 0.02 * top <= t <= top]
+    bar.set_ticks(ticks, labels=[f"{t:g}" for t in ticks])
+    bar.minorticks_off()
