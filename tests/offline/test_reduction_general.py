@@ -566,3 +566,68 @@ def test_a_large_sparse_system_that_passes_nothing_on_reduces_to_its_d(fields, s
     reduced = method(system, **size)
     assert reduced.order == 0
     assert reduced.error_bound in (0.0, None)
+
+
+def oscillators(damping_ratio):
+    """Ten of 1, 2, ..., 10 rad/s, pushed and seen together: (system, its transfer function in closed form)."""
+    frequencies = np.arange(1.0, 11.0)
+    blocks = [np.array([[0, w], [-w, -2 * damping_ratio * w]]) for w in frequencies]
+    b, c = np.tile([0.0, 1.0], 10)[:, None], np.tile([1.0, 0.0], 10)[None]
+
+    def closed_form(s):
+        s = s[:, None]
+        return np.sum(frequencies / (s**2 + 2 * damping_ratio * frequencies * s + frequencies**2), axis=1)
+
+    return LinearSystem(scipy.linalg.block_diag(*blocks), b, c, np.zeros((1, 1))), closed_form
+
+
+def around_the_resonances(damping_ratio, reduced):
+    """Frequencies, rad/s."""
+    near = 1 + damping_ratio * np.linspace(-5, 5, 41)
+    own = np.abs(reduced.system.poles.imag)
+    return np.concatenate([[0.0], np.linspace(0.01, 12, 400), np.outer(np.arange(1, 11), near).ravel(), own])
+
+
+@pytest.mark.parametrize("method", WITH_BOUND)
+@pytest.mark.parametrize("damping_ratio", [1e-2, 1e-4, 1e-6, 1e-8, 1e-9])
+def test_lightly_damped_oscillators_keep_to_the_bound_or_are_refused(damping_ratio, method):
+    system, closed_form = oscillators(damping_ratio)
+    refused = 0
+    for order in range(2, 21):
+        try:
+            reduced = method(system, order)
+        except ReductionError as error:
+            assert "too lightly damped" in str(error)
+            refused += 1
+            continue
+        omega = around_the_resonances(damping_ratio, reduced)
+        exact = closed_form(1j * omega)
+        error = np.max(np.abs(reduced.system.transfer(1j * omega)[:, 0, 0] - exact))
+        # Round-off moves a pole p by about 1e-16 |p|, times the algorithm's constant, and so its peak by that over |Re p|.
+        round_off = 1e-13 / damping_ratio * np.max(np.abs(exact))
+        assert error <= reduced.error_bound + round_off, order
+    assert refused == 0 or (damping_ratio == 1e-9 and refused <= 3)
+
+
+@pytest.mark.parametrize("damping_ratio", [1e-4, 1e-6, 1e-8])
+def test_singular_perturbation_keeps_both_states_of_an_oscillator_or_none(damping_ratio):
+    system, _ = oscillators(damping_ratio)
+    sigma = balanced_truncation(system, 20).hankel_singular_values
+    equal = np.abs(sigma[10] / sigma[11] - 1) < 1e-6
+    assert singular_perturbation_balancing(system, 11).order == (10 if equal else 11)
+    reduced = singular_perturbation_balancing(system, tolerance=0.9)
+    assert reduced.error_bound <= 0.9 * sigma[0]
+
+
+@pytest.mark.parametrize("damping_ratio", [1e-4, 1e-6, 1e-8])
+def test_band_limited_truncation_does_not_step_over_narrow_resonances(damping_ratio):
+    system, closed_form = oscillators(damping_ratio)
+    reduced = band_limited_truncation(system, (0.0, 1.0), 12)  # the six oscillators below 2 pi rad/s
+    omega = around_the_resonances(damping_ratio, reduced)
+    omega = omega[omega < 2 * np.pi]
+    exact = closed_form(1j * omega)
+    error = np.max(np.abs(reduced.system.transfer(1j * omega)[:, 0, 0] - exact))
+    # The other four answer with 1.2 up there, off their resonance; the highest peak is 1 / (2 damping ratio).
+    assert error < 4 * 2.4 * damping_ratio * np.max(np.abs(exact)) + 1e-13 / damping_ratio * np.max(
+        np.abs(exact)
+    )

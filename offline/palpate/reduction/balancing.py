@@ -38,7 +38,8 @@ class Gramians:
     """Factors of the two Gramians, control control^T and E^T observe observe^T E.
 
     control (n, k), observe (n, l)
-    missing    what the Hankel singular values can differ by in sum from those of the whole Gramians
+    missing    what the Hankel singular values can differ by in sum from those of the whole Gramians; of low-rank
+               factors of a sparse system an estimate
     symmetric  whether observe is control times signs, so that observe^T E control is symmetric
     """
 
@@ -76,6 +77,13 @@ class Balancing:
     def tail(self, order: int) -> float:
         """The sum of all Hankel singular values beyond the first `order`, as sure as `Gramians.missing`."""
         return float(np.sum(self.sigma[order:])) + self.gramians.missing
+
+    def separated_orders(self, largest: int, gap: float) -> NDArray[np.intp]:
+        """0 and the orders r up to largest, at most the rank, with sigma_r - sigma_{r+1} > gap sigma_{r+1}, ascending."""
+        orders = np.arange(1, largest + 1)
+        following = np.append(self.sigma, 0.0)[orders]
+        apart = self.sigma[orders - 1] - following > gap * following
+        return np.concatenate([[0], orders[apart]]).astype(np.intp)
 
     def relative_to_largest(self, value: float) -> float:
         """value / sigma_1; where no state is reached and seen, so that there is no sigma_1 above 0: 0."""

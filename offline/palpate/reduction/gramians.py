@@ -18,6 +18,15 @@ from palpate.reduction.balancing import Gramians, missing_in_sum
 
 Array = NDArray[np.float64]
 
+BAND_FREQUENCIES = 120
+"""Points over a band without narrow resonances: panels of a quarter of an octave or so."""
+
+_NARROW = 0.01
+"""|Re p| / |p| of poles whose resonance the panels of the band step over."""
+
+_MOST_RESONANCES = 60
+"""Narrow resonances that get panels of their own, the narrowest first: each costs some tens of points."""
+
 
 @dataclass(frozen=True)
 class RealForm:
@@ -118,17 +127,16 @@ def gramians(system: DiagonalSystem, tolerance: float) -> Gramians:
 
 
 def band_controllability_factor(
-    system: DiagonalSystem, band: tuple[float, float], n_frequencies: int
+    system: DiagonalSystem, band: tuple[float, float], n_frequencies: int = BAND_FREQUENCIES
 ) -> Array:
-    """(n_states, 2 n_inputs n_frequencies): L with L L^T about the controllability Gramian limited to the band.
+    """(n_states, k): L with L L^T about the controllability Gramian limited to the band; k is 2 n_inputs a frequency.
 
     band  (low, high), rad/s, 0 <= low < high
 
     P = 1/(2 pi) times the integral over |omega| in the band of (j omega - A)^-1 B B^* (j omega - A)^-*, by
     `band_quadrature`; +-omega together give the real and the imaginary part of a column (Gawronski & Juang 1990).
     """
-    slowest = float(np.min(np.abs(system.poles), initial=band[1]))
-    omega, weight = band_quadrature(band, slowest, n_frequencies)
+    omega, weight = band_quadrature(band, system.poles, n_frequencies)
     n, m = system.n_states, system.n_inputs
     form = real_form(system)
     columns = np.empty((n, len(omega), 2, m))
@@ -144,13 +152,20 @@ def band_controllability_factor(
     return columns.reshape(n, 2 * m * len(omega))
 
 
-def band_quadrature(band: tuple[float, float], slowest: float, n_points: int) -> tuple[Array, Array]:
-    """Points (rad/s) and weights of composite Gauss-Legendre quadrature over the band, about n_points of them.
+def band_quadrature(
+    band: tuple[float, float], poles: NDArray[np.complex128], n_points: int = BAND_FREQUENCIES
+) -> tuple[Array, Array]:
+    """Points (rad/s) and weights of composite Gauss-Legendre quadrature over the band.
 
-    slowest  smallest |pole|, rad/s. Panels of 4 points are even in log(omega) above a tenth of it, where the
-             integrand varies over octaves; below, where it is nearly constant, one panel goes down to the band's start.
+    poles     (n,), 1/s, of the integrand
+    n_points  about so many, and those of the narrow resonances
+
+    Panels of 4 points are even in log(omega) above a tenth of the smallest |pole|, where the integrand varies over
+    octaves; below, where it is nearly constant, one panel goes down to the band's start. Around a resonance narrower than
+    a panel they are cut into ones that grow in proportion to the distance from it.
     """
     low, high = band
+    slowest = float(np.min(np.abs(poles), initial=high))
     knee = min(max(low, slowest / 10), high)
     n_panels = max(1, n_points // 4)
     edges: Array = np.array([low])
@@ -159,10 +174,24 @@ def band_quadrature(band: tuple[float, float], slowest: float, n_points: int) ->
         n_panels = max(1, n_panels - 1)
     if high > knee:
         edges = np.append(edges, knee * (high / knee) ** (np.arange(1, n_panels + 1) / n_panels))
+    edges = np.unique(np.concatenate([edges, _edges_around_resonances(band, poles)]))
     x, w = np.polynomial.legendre.leggauss(4)
     half = np.diff(edges) / 2
     middle = (edges[1:] + edges[:-1]) / 2
     return (middle[:, None] + half[:, None] * x).ravel(), (half[:, None] * w).ravel()
+
+
+def _edges_around_resonances(band: tuple[float, float], poles: NDArray[np.complex128]) -> Array:
+    """(k,), rad/s, inside the band: Im p + |Re p| (0, +-2, +-10, +-50, ...), as far as Im p / 10, for narrow ones."""
+    low, high = band
+    narrow = poles[
+        (poles.imag > low / 1.1) & (poles.imag < high * 1.1) & (-poles.real < _NARROW * poles.imag)
+    ]
+    narrow = narrow[np.argsort(-narrow.real / narrow.imag)][:_MOST_RESONANCES]
+    steps = 2 * 5.0 ** np.arange(20)
+    offsets = -narrow.real[:, None] * np.concatenate([-steps, [0.0], steps])
+    edges = narrow.imag[:, None] + offsets
+    return np.asarray(edges[(np.abs(offsets) <= narrow.imag[:, None] / 10) & (edges > low) & (edges < high)])
 
 
 def _first_state(system: DiagonalSystem) -> NDArray[np.intp]:

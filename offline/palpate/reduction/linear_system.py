@@ -110,6 +110,7 @@ class LinearSystem:
         """What the real parts of the poles are uncertain by at least, 1/s: a pole nearer to the axis may lie on it."""
         return 1e-13 * float(np.max(np.abs(self.poles), initial=0.0))
 
+    @cached_property
     def outlying_poles(self) -> Complex:
         """(k,): of a sparse system a few poles nearest to 0, and those of positive real part that stand out.
 

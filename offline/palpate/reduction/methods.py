@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 # The trace of what a Gramian factor leaves out, relative to the Gramian's. Hankel singular values are off by about its
 # square root at worst, so this keeps them to 1e-10 of the largest.
 _GRAMIAN_TOLERANCE = 1e-20
-_BAND_FREQUENCIES = 120
 
 Response = Callable[[DiagonalSystem, Array], NDArray[np.complex128]]
 
@@ -171,7 +170,7 @@ def _balanced(system: DiagonalSystem, gramians: Gramians) -> Family:
 
 def _band_limited(system: DiagonalSystem, band_hz: tuple[float, float]) -> Gramians:
     band = (2 * math.pi * band_hz[0], 2 * math.pi * band_hz[1])
-    control = band_controllability_factor(system, band, _BAND_FREQUENCIES)
+    control = band_controllability_factor(system, band)
     return Gramians(control, gramians(system, _GRAMIAN_TOLERANCE).observe)
 
 

@@ -4,7 +4,9 @@ All take a plain `LinearSystem` (dense, or sparse with many states) or a `Diagon
 faster. `order` counts real states; where further ones are round-off the result has fewer. Each raises ReductionError
 for a system that is not stable, unless its unstable part is to be split off, kept as it is, and added again.
 
-Bounds are those of exact arithmetic: errors below about 1e-11 of the response are round-off.
+Bounds are those of exact arithmetic: errors below about 1e-11 of the response are round-off, or below 1e-13 |p| / |Re p|
+of it where the least damped pole p makes that more. With poles of |Re p| < 1e-6 |p| the bound is checked at their
+resonances, and a reduction that does not keep to it is a ReductionError.
 """
 
 from __future__ import annotations
@@ -42,10 +44,14 @@ DENSE_STATES = 2500
 
 _GRAMIAN_TOLERANCE = 1e-20
 
+_EQUAL = 1e-6
+"""Hankel singular values this near to each other, relatively, are not separated by singular perturbation."""
+
+_LIGHTLY_DAMPED = 1e-6
+"""|Re p| / |p| below which round-off moves a pole so far that a bound may fail."""
+
 _AXIS = 1e-12
 """|Re p| / |p| below which a pole of a large sparse system may lie on the imaginary axis, by round-off."""
-
-_BAND_FREQUENCIES = 120
 
 
 @dataclass(frozen=True)
@@ -84,7 +90,8 @@ def balanced_truncation(
     """
     part = prepare(system, order, tolerance, unstable)
     balancing = balance(part.realisation, part.gramians())
-    r = part.chosen_order(balancing.rank, lambda k: balancing.relative_to_largest(2 * balancing.tail(k)))
+    orders = np.arange(balancing.rank + 1)
+    r = part.chosen_order(orders, lambda k: balancing.relative_to_largest(2 * balancing.tail(k)))
     reduced = balancing.truncated(part.realisation, r)
     return part.result("balanced truncation", reduced, balancing.sigma, 2 * balancing.tail(r))
 
@@ -98,12 +105,14 @@ def singular_perturbation_balancing(
 ) -> ReducedSystem:
     """The weak states of the balanced realisation follow at once instead of being dropped: exact statics.
 
-    The bound is that of balanced truncation (Liu & Anderson 1989); tolerance as there.
+    The bound is that of balanced truncation (Liu & Anderson 1989); tolerance as there. Nearly equal Hankel singular values
+    are kept or dropped together: half of a lightly damped oscillator that follows at once has no meaning.
     """
     part = prepare(system, order, tolerance, unstable)
     balancing = balance(part.realisation, part.gramians())
     full = balancing.truncated(part.realisation, balancing.rank)
-    r = part.chosen_order(balancing.rank, lambda k: balancing.relative_to_largest(2 * balancing.tail(k)))
+    orders = balancing.separated_orders(balancing.rank, _EQUAL)
+    r = part.chosen_order(orders, lambda k: balancing.relative_to_largest(2 * balancing.tail(k)))
     a, b, c = full.a, full.b, full.c
     fast = np.linalg.solve(a[r:, r:], np.hstack([a[r:, :r], b[r:]]))
     reduced = LinearSystem(
@@ -140,7 +149,7 @@ def band_limited_truncation(
     if order is None:
         r = _smallest_in_band(part.stable, part.realisation, balancing, band_hz, part.tolerance)
     else:
-        r = part.chosen_order(balancing.rank, lambda k: math.inf)
+        r = part.chosen_order(np.arange(balancing.rank + 1), lambda k: math.inf)
     reduced = balancing.truncated(part.realisation, r)
     return part.result("band-limited truncation", reduced, balancing.sigma, None)
 
@@ -221,19 +230,22 @@ class Prepared:
         except NotConvergedError as error:
             raise ReductionError(str(error)) from error
         sigma = np.linalg.svd(observe.T @ stable.mass(control), compute_uv=False)
-        # The singular values that the iteration has not seen count as the last that it has.
+        # An estimate: the singular values that the iteration has not seen count as the last that it has.
         last = float(sigma[-1]) if len(sigma) else 0.0
         return Gramians(control, observe, (stable.n_states - len(sigma)) * last)
 
-    def chosen_order(self, rank: int, relative_bound: Callable[[int], float]) -> int:
-        """Order of the stable part: as asked but no larger than rank, or the first whose bound is in the tolerance."""
+    def chosen_order(self, orders: NDArray[np.intp], relative_bound: Callable[[int], float]) -> int:
+        """Order of the stable part, of those given (from 0, ascending): the largest of at most what is asked, or the
+        first whose bound is in the tolerance.
+        """
         if self.order is not None:
-            return min(self.order - self.n_unstable, rank)
-        for r in range(rank + 1):
+            return int(orders[orders <= self.order - self.n_unstable][-1])
+        for r in orders.tolist():
             if relative_bound(r) <= self.tolerance:
-                return r
+                return int(r)
+        last = int(orders[-1])
         raise ReductionError(
-            f"tolerance = {self.tolerance:g}: {relative_bound(rank):.2g} at order {rank} is the least above round-off"
+            f"tolerance = {self.tolerance:g}: {relative_bound(last):.2g} at order {last} is the least above round-off"
         )
 
     def result(self, method: str, reduced: LinearSystem, sigma: Array, bound: float | None) -> ReducedSystem:
@@ -243,8 +255,27 @@ class Prepared:
                 f"{method} to {reduced.n_states} states has a spectral abscissa of {reduced.spectral_abscissa:.3g} 1/s, "
                 "expected below 0: choose another order"
             )
+        if bound is not None:
+            self._check_bound(method, reduced, bound)
         whole = reduced if self.rest is None else parallel(reduced, self.rest)
         return ReducedSystem(method, whole, sigma, bound)
+
+    def _check_bound(self, method: str, reduced: LinearSystem, bound: float) -> None:
+        """At the resonances of very lightly damped poles. A large sparse system has none: its Gramians would not do."""
+        if isinstance(self.stable, LinearSystem) and self.stable.is_sparse:
+            return
+        poles = np.concatenate([self.stable.poles, reduced.poles])
+        narrow = poles[(poles.imag > 0) & (-poles.real < _LIGHTLY_DAMPED * poles.imag)]
+        if not len(narrow):
+            return
+        full = self.stable.transfer(1j * narrow.imag)
+        error = float(np.max(spectral_norms(full - reduced.transfer(1j * narrow.imag))))
+        round_off = 1e-13 * float(np.max(narrow.imag / -narrow.real) * np.max(spectral_norms(full)))
+        if not error <= bound + round_off:
+            raise ReductionError(
+                f"{method} to {reduced.n_states} states has an error of {error:.3g} at a resonance, expected at most "
+                f"{bound:.3g}: the system is too lightly damped for double precision there, choose another order"
+            )
 
 
 def prepare(system: System, order: int | None, tolerance: float | None, unstable: Unstable) -> Prepared:
@@ -292,7 +323,7 @@ def _large(system: LinearSystem, unstable: Unstable) -> LinearSystem:
             f"unstable = 'split' with a sparse system of {system.n_states} states: expected a dense one, or at most "
             f"{DENSE_STATES} states"
         )
-    poles = system.outlying_poles()
+    poles = system.outlying_poles
     wrong = poles[~(poles.real < -_AXIS * np.abs(poles))]
     if len(wrong):
         raise ReductionError(
@@ -305,9 +336,8 @@ def _large(system: LinearSystem, unstable: Unstable) -> LinearSystem:
 def _band_factor(system: System, band: tuple[float, float]) -> Array:
     """(n, k): factor of the controllability Gramian limited to the band (rad/s), by quadrature over the frequency."""
     if isinstance(system, DiagonalSystem):
-        return band_controllability_factor(system, band, _BAND_FREQUENCIES)
-    slowest = band[1] / 1000 if system.is_sparse else float(np.min(np.abs(system.poles), initial=band[1]))
-    omega, weight = band_quadrature(band, slowest, _BAND_FREQUENCIES)
+        return band_controllability_factor(system, band)
+    omega, weight = band_quadrature(band, system.outlying_poles if system.is_sparse else system.poles)
     columns = system.solutions(1j * omega) * np.sqrt(weight / np.pi)[:, None, None]
     stacked = np.concatenate([columns.real, columns.imag])
     return stacked.transpose(1, 0, 2).reshape(system.n_states, len(stacked) * system.n_inputs)
