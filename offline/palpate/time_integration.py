@@ -91,7 +91,12 @@ def newmark(
         raise ValueError(f"inputs has shape {inputs.shape}: expected (n_samples, {n_inputs}) finite numbers")
     if not (np.isfinite(period_s) and period_s > 0):
         raise ValueError(f"period_s = {period_s}: expected a time above 0")
-    watch = equations.value[np.asarray(observed, dtype=np.int64)]
+    rows = np.asarray(observed, dtype=np.int64)
+    n_values = equations.value.shape[0]
+    outside = (rows < 0) | (rows >= n_values)
+    if np.any(outside):
+        raise ValueError(f"observed = {rows[outside].tolist()}: expected indices from 0 to {n_values - 1}")
+    watch = equations.value[rows]
     mass, elastic = equations.mass, equations.elastic
     # Stress memories of the equations and of the tip forces obey one recursion: stack them.
     stress = csr_array(block_array([[elastic], [equations.force_elastic]]))

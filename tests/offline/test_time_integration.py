@@ -101,9 +101,14 @@ def test_without_a_prony_series_the_conservative_model_conserves_energy_when_the
     assert abs(drift) < 2e-3
 
 
-def test_inputs_of_the_wrong_shape_are_refused(model):
+def test_inputs_of_the_wrong_shape_and_indices_out_of_range_are_refused(model):
     _, equations, _ = model
     with pytest.raises(ValueError, match=r"inputs has shape \(5,\)"):
         newmark(equations, PRONY, np.zeros(5), 0.01)
     with pytest.raises(ValueError, match="period_s = 0"):
         newmark(equations, PRONY, np.zeros((5, equations.driving.shape[1])), 0.0)
+    inputs = np.zeros((5, equations.driving.shape[1]))
+    n_values = equations.value.shape[0]
+    for index in (-1, n_values):
+        with pytest.raises(ValueError, match=f"observed = .* from 0 to {n_values - 1}"):
+            newmark(equations, PRONY, inputs, 0.01, observed=[0, index])
