@@ -70,14 +70,21 @@ def reconstruct(target: Floats, velocity: Floats, age_ns: int, position: Floats)
         position[i] = target[i] + velocity[i] * seconds
 
 
+@compiled_exactly
+def is_finite(value: float) -> bool:
+    return math.isfinite(value)
+
+
 @compiled
 def follow(target: Floats, applied: Floats, workspace_radius: float, max_step: float) -> int:
     """Move `applied` (3,) towards `target` (3,), no further than `max_step` and not out of the workspace; flags.
 
-    `target` is finite; `applied` is changed in place. All in m.
+    `applied` is changed in place; it stays where it is when `target` has no finite length. All in m.
     """
     flags = 0
     length = math.sqrt(target[0] ** 2 + target[1] ** 2 + target[2] ** 2)
+    if not is_finite(length):
+        return _WORKSPACE_CLAMPED
     inside = 1.0
     if length > workspace_radius:
         inside = workspace_radius / length

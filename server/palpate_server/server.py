@@ -198,7 +198,9 @@ class Server:
                 return "not_holder"
             if command.sequence <= self._last_sequence[contact]:
                 return "old_sequence"
-        return None if wire.is_finite(command) else "not_finite"
+        if not wire.is_finite(command):
+            return "not_finite"
+        return None if wire.is_in_range(command) else "out_of_range"
 
     def _send_forces(self) -> None:
         """Publish the ticks that are not sent yet, in order, unless another thread is at it (which then is told)."""

@@ -23,6 +23,7 @@ ENCODING = "application/msgpack;palpate.v1"
 MAX_COMMAND_BYTES = 4096
 MAX_REQUEST_BYTES = 16384
 MAX_RECORDED_BYTES = 2**20
+FARTHEST_M, FASTEST_M_PER_S = 1e3, 1e3  # no device is there: what is beyond is a mistake
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _MAX_INT64 = 2**63 - 1
@@ -41,7 +42,7 @@ class MalformedMessage(ValueError):
 
 # Why a payload can't be read, and why a readable command is not carried out: the counters in the status message.
 MALFORMED = ("too_large", "not_msgpack", "not_a_map", "missing_field", "wrong_type", "wrong_shape")
-REFUSED = ("not_finite", "unknown_contact", "not_holder", "old_sequence", "stopping")
+REFUSED = ("not_finite", "out_of_range", "unknown_contact", "not_holder", "old_sequence", "stopping")
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,18 @@ def is_finite(command: Command) -> bool:
     for vectors in (command.displacement_m, command.velocity_m_per_s):
         for x, y, z in vectors.values():
             if x - x + y - y + z - z != 0.0:  # infinity minus itself is not a number either
+                return False
+    return True
+
+
+def is_in_range(command: Command) -> bool:
+    """True when no component is beyond FARTHEST_M and FASTEST_M_PER_S: nothing computed from it overflows."""
+    for vectors, largest in (
+        (command.displacement_m, FARTHEST_M),
+        (command.velocity_m_per_s, FASTEST_M_PER_S),
+    ):
+        for x, y, z in vectors.values():
+            if not (abs(x) <= largest and abs(y) <= largest and abs(z) <= largest):
                 return False
     return True
 

@@ -192,6 +192,45 @@ def test_another_frame_leaves_the_tip_where_it_is_in_the_model(memory: loop.Memo
     np.testing.assert_allclose(memory.displacement, before, atol=1e-15)
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_extreme_numbers_hold_the_tip_and_leave_another_contact_alone(
+    make_spring_mass_model: Callable[..., ReducedModel], sign: float
+) -> None:
+    """What the wire refuses must do no harm in the loop either: here displacement and velocity overflow together."""
+    model = make_spring_mass_model(2)
+    usual = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
+    memory, undisturbed = (
+        loop.make_memory(model.discrete, model.period_s, [usual, usual], 1 / 30) for _ in range(2)
+    )
+    huge = (sign * 1.797e308,) * 3
+    for i in range(300):
+        now = time.monotonic_ns()
+        good = (0.0, 0.0, 1e-3)
+        for m in (memory, undisturbed):
+            loop.write_command(m.commands, 1, i, 7, now, -1, good, (0.0, 0.0, 0.0))
+            loop.write_command(m.commands, 0, i, 7, now, -1, good, (0.0, 0.0, 0.0))
+        if i >= 250:
+            loop.write_command(memory.commands, 0, i, 7, now - 5_000_000, -1, huge, huge)
+        for m in (memory, undisturbed):
+            tick(m)
+    row = (loop.records_written(memory.shared) - 1) % loop.RECORDS
+    np.testing.assert_array_equal(memory.record_motion[row, 0, 0:3], (0.0, 0.0, 1e-3))
+    np.testing.assert_array_equal(memory.record_motion[row], undisturbed.record_motion[row])
+    assert np.any(memory.record_motion[row, 1, 3:6])
+    assert memory.counters[loop.FAULTS] == 0
+
+
+@pytest.mark.parametrize("size", [1e160, 1.797e308, float("inf"), float("nan")])
+def test_a_target_without_a_finite_length_is_not_followed(memory: loop.Memory, size: float) -> None:
+    command(memory, 0, (0.0, 0.0, 1e-3))
+    tick(memory)
+    command(memory, 1, (size, -size, size))
+    flags, applied, force, _ = tick(memory)
+    assert flags & Flags.WORKSPACE_CLAMPED
+    np.testing.assert_array_equal(applied, (0.0, 0.0, 1e-3))
+    assert np.all(np.isfinite(force))
+
+
 def test_a_velocity_carries_the_displacement_on_between_commands(memory: loop.Memory) -> None:
     now = time.monotonic_ns()
     loop.write_command(memory.commands, 0, 1, 7, now - 4_000_000, -1, (1e-3, 0.0, 0.0), (0.1, 0.0, 0.0))

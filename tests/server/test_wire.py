@@ -103,6 +103,18 @@ def test_numbers_that_are_not_finite_are_recognised(bad: float) -> None:
         assert not wire.is_finite(command)
 
 
+@pytest.mark.parametrize("field", ["displacement_m", "velocity_m_per_s"])
+@pytest.mark.parametrize(("value", "in_range"), [(1e3, True), (1000.1, False), (1.797e308, False)])
+def test_numbers_that_no_device_gives_are_recognised(field: str, value: float, in_range: bool) -> None:
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            vector = [0.0, 0.0, 0.0]
+            vector[axis] = sign * value
+            command = wire.decode_command(msgpack.packb(GOOD | {field: {"tip": vector}}))
+            assert wire.is_finite(command)
+            assert wire.is_in_range(command) == in_range
+
+
 @pytest.mark.parametrize("name", ["", "a/b", "*", "a b", "@a", "x" * 65, None, 3])
 def test_names_that_could_change_a_key_expression_are_refused(name: object) -> None:
     assert not wire.is_name(name)
