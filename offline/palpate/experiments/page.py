@@ -9,16 +9,18 @@ from palpate.experiments.examples import DISC_DRAG_PER_S
 from palpate.experiments.figure import Figure
 
 _PAPER: dict[int, str] = {
-    2: "The deflection of the disc's centre by PCMFS with 500 nodes and by 146 linear triangles; the curves nearly coincide.",
-    3: "PCMFS and finite elements both converge; PCMFS is clearly less accurate at the same number of nodes. No orders are stated.",
+    2: "The deflection of the disc's centre by PCMFS with 500 nodes and by 146 linear triangular finite elements.",
+    3: 'Convergence in the L2 norm of PCMFS and finite elements; PCMFS is "clearly less accurate" at the same number of nodes. '
+    "No orders are stated.",
     4: "600 of 800 states. TBR captures most of the dynamics; Hankel-optimal has a steady error at high frequencies; modal "
     "truncation has the highest error and misses peaks.",
     5: "TBR has the lowest relative error, modal truncation the shortest solution time.",
-    6: "Both converge, finite elements more accurate. No orders are stated.",
+    6: "Convergence in the L2 norm of PCMFS and linear triangles; the text compares no accuracies and states no orders.",
     7: "200 of 400 states. Hankel-optimal is poor at high frequencies, modal truncation at low ones; TBR captures most of "
     "the dynamics with a steady error at high frequencies.",
     8: "TBR has the lowest error, modal truncation the shortest time.",
-    9: "Both converge in the L2 norm: linear tetrahedra, and PCMFS with linear consistency.",
+    9: "Convergence in the L2 norm of linear tetrahedra and of PCMFS with linear consistency; the text compares no accuracies and "
+    "states no orders.",
     10: "3,000 degrees of freedom, the reduced order is not stated. Hankel-optimal and modal truncation are poor at high "
     "frequencies, TBR captures most of the dynamics.",
     11: "The reaction force in the middle of the upper face over 5 s at steps of 1 ms, full and reduced.",

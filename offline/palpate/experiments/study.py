@@ -143,13 +143,19 @@ def static_error(full: DiagonalSystem, small: DiagonalSystem) -> float:
     return float(relative_errors(full.transfer(zero), small.transfer(zero))[0])
 
 
-def ranking(values: dict[str, float], unit: Callable[[float], str]) -> str:
-    """The names by ascending value with their values; those that differ by less than a tenth count as equal."""
-    ascending = sorted(values.items(), key=lambda item: item[1])
-    text = ""
-    for i, (name, value) in enumerate(ascending):
-        if i:
-            text += " ≈ " if value <= 1.1 * ascending[i - 1][1] else " < "
+TIME_SCATTER = 2.0
+"""Factor by which times of the same work differ between runs on a busy machine: what is closer counts as equal."""
+
+
+def ranking(values: dict[str, float], unit: Callable[[float], str], equal_within: float = 1.1) -> str:
+    """The names by ascending value with their values; those within the factor of the least of a group count as equal."""
+    text, least = "", 0.0
+    for name, value in sorted(values.items(), key=lambda item: item[1]):
+        new_group = value > equal_within * least
+        if text:
+            text += " < " if new_group else " ≈ "
+        if new_group:
+            least = value
         text += f"{name} ({unit(value)})"
     return text
 
