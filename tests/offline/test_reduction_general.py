@@ -631,3 +631,20 @@ def test_band_limited_truncation_does_not_step_over_narrow_resonances(damping_ra
     assert error < 4 * 2.4 * damping_ratio * np.max(np.abs(exact)) + 1e-13 / damping_ratio * np.max(
         np.abs(exact)
     )
+
+
+@pytest.mark.parametrize("size", [{"order": 3}, {"tolerance": 1e-3}], ids=["order", "tolerance"])
+@pytest.mark.parametrize("method", [*BALANCING, band_limited])
+@pytest.mark.parametrize(("poles", "b"), [([-1, -2 + 3j], 0.0), ([], 1.0)], ids=["zero B", "no states"])
+def test_a_diagonal_system_that_passes_nothing_on_reduces_to_its_d(poles, b, method, size):
+    n = len(poles)
+    system = DiagonalSystem(
+        np.array(poles, dtype=complex),
+        np.full((n, 2), b, dtype=complex),
+        np.ones((3, n), dtype=complex),
+        np.ones((3, 2)),
+        np.arange(n),
+    )
+    reduced = method(system, **size)
+    assert reduced.order == 0
+    assert np.array_equal(reduced.system.d, system.d)

@@ -19,7 +19,7 @@ from palpate.reduction.balancing import Gramians, missing_in_sum
 Array = NDArray[np.float64]
 
 BAND_FREQUENCIES = 120
-"""Points over a band without narrow resonances: panels of a quarter of an octave or so."""
+"""Points over a band without narrow resonances, about; 30 panels, of a fraction of an octave each."""
 
 _NARROW = 0.01
 """|Re p| / |p| of poles whose resonance the panels of the band step over."""

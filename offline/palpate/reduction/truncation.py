@@ -3,6 +3,7 @@
 All take a plain `LinearSystem` (dense, or sparse with many states) or a `DiagonalSystem`, whose Gramians come much
 faster. `order` counts real states; where further ones are round-off the result has fewer. Each raises ReductionError
 for a system that is not stable, unless its unstable part is to be split off, kept as it is, and added again.
+A sparse system of more than DENSE_STATES states can't be split, except by modal truncation, which makes it dense.
 
 Bounds are those of exact arithmetic: errors below about 1e-11 of the response are round-off, or below 1e-13 |p| / |Re p|
 of it where the least damped pole p makes that more. With poles of |Re p| < 1e-6 |p| the bound is checked at their
