@@ -9,7 +9,7 @@ from typing import Any
 
 from palpate.experiments.examples import PERIOD_S, Example
 from palpate.experiments.figure import Cell, Figure, tidy
-from palpate.experiments.methods import ALL, BAND, Method
+from palpate.experiments.methods import ALL, Method
 from palpate.experiments.study import Study, per_cent, static_error
 from palpate.reduction.evidence import hinf_error, in_band_error
 from palpate.reduction.frequencies import band_frequencies
@@ -201,12 +201,6 @@ def _smallest_orders(measured: Sequence[Point], examples: Sequence[Example]) -> 
         lines.append(f"| {method.label} | " + " | ".join(cells) + " |")
     lines.append("")
     lines += [f"- Fewest states asked for, {e.name}: {_fewest_states(measured, e)}." for e in examples]
-    nearly_lossless = [p for p in measured if p.example == "disc" and p.method is BAND]
-    if nearly_lossless and nearly_lossless[-1].error_band > _GOOD_ENOUGH:
-        lines.append(
-            "\nBand-limited truncation fails on the nearly lossless disc: the quadrature of its band Gramian takes 120 frequencies, "
-            "which step over resonances that narrow. Tissue is damped, as the square and the cube are."
-        )
     lines.append(
         "\nThis plot decides: where the motion is known to stay in a band, as a hand's does, band-limited truncation; where a bound "
         "over all frequencies is wanted, TBR or HOM, and singular perturbation balancing if the statics must be exact, too."
