@@ -19,7 +19,7 @@ import zenoh
 
 from palpate.model import ModelFileError, load_model
 from palpate_server import transport, wire
-from palpate_server.safety import Limits
+from palpate_server.safety import Limits, least_force_rate
 from palpate_server.server import serve
 
 EXIT_REFUSED = 2
@@ -37,6 +37,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.workspace_m,
         0.0,
     )
+    least = least_force_rate(limits.max_force_n)
+    if limits.max_force_rate_n_per_s < least:
+        print(
+            f"palpate serve: --max-force-rate-n-per-s is {limits.max_force_rate_n_per_s:g}: expected at least "
+            f"{least:g}, so that {limits.max_force_n:g} N can fade in time when a client is gone",
+            file=sys.stderr,
+        )
+        return EXIT_REFUSED
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

@@ -19,11 +19,15 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Terms:
-    """How a contact is held: within which limits and in which frame, from which tick on."""
+    """How a contact is held: within which limits and in which frame, from which tick on.
+
+    held_since_tick is the first tick of the present hold, which begins at rest; limits may have changed since.
+    """
 
     limits: Limits
     frame: Frame
     since_tick: int = 0
+    held_since_tick: int = 0
 
 
 class Leases:

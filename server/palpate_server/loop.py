@@ -274,12 +274,12 @@ def forget_command(commands: Commands, contact: int) -> None:
 @compiled
 def is_silent(image: Image, contact: int) -> bool:
     """True when the force of a contact has faded to zero."""
-    return _memory(image).scale[contact] == 0.0
+    return _has_faded(_memory(image), contact)
 
 
 @compiled
 def set_frame(image: Image, contact: int, rotation: Floats, scale: float, origin: Floats) -> int:
-    """Give a silent contact another frame, between two ticks; the tip stays where it is in the model.
+    """Give a silent contact another frame, between two ticks, and put its tip to rest: who comes next starts clean.
 
     rotation (3, 3), origin (3,), m. Returns the first tick that uses it.
     """
@@ -288,12 +288,7 @@ def set_frame(image: Image, contact: int, rotation: Floats, scale: float, origin
     m.rotation[contact] = rotation
     m.frame_scale[contact] = scale
     m.origin[contact] = origin
-    for i in range(3):
-        position = 0.0
-        for j in range(3):
-            position += rotation[j, i] * m.displacement[contact, j]
-        m.applied[contact, i] = position / scale + origin[i]
-        m.target[contact, i] = m.applied[contact, i]
+    _put_to_rest(m, contact)
     tick = m.counters[TICKS]
     store_release(m.shared, LOCK, 0)
     return tick
@@ -312,12 +307,17 @@ def set_limits(image: Image, contact: int, limits: Floats) -> int:
 
 @compiled
 def reset(image: Image) -> int:
-    """Put the model to rest, between two ticks; every force starts from zero again. Returns the first tick after it."""
+    """Put the model and all tips to rest, between two ticks; every force fades in again. Returns the first tick after it.
+
+    A force that a device is rendering is not forgotten: it comes down at the allowed rate.
+    """
     _take_lock(_memory(image))
     m = _memory(image)
     m.model.state[:] = 0.0
     m.next_model.state[:] = 0.0
     m.scale[:] = 0.0
+    for i in range(m.applied.shape[0]):
+        _put_to_rest(m, i)
     tick = m.counters[TICKS]
     store_release(m.shared, LOCK, 0)
     return tick
@@ -341,6 +341,22 @@ def exchange(image: Image, replacement: Image) -> int:
 def repeat_tick(image: Image, start_ns: int) -> None:
     """Run the next tick as if it began at `start_ns`: for replays, where no other thread is at work."""
     _run_tick(_memory(image), start_ns, start_ns, False)
+
+
+@compiled
+def _put_to_rest(m: Memory, contact: int) -> None:
+    """The tip is where its frame has its rest, on the undeformed surface, and nothing has gone through its port."""
+    for i in range(3):
+        m.target[contact, i] = m.position[contact, i] = m.applied[contact, i] = m.origin[contact, i]
+        m.velocity[contact, i] = 0.0
+        m.displacement[contact, i] = 0.0
+    m.energy[contact] = 0.0
+
+
+@compiled
+def _has_faded(m: Memory, contact: int) -> bool:
+    force = m.previous_force[contact]
+    return m.scale[contact] == 0.0 and force[0] == 0.0 and force[1] == 0.0 and force[2] == 0.0
 
 
 @compiled
@@ -472,15 +488,18 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
                 flags |= _HELD
             _count(m, INPUT_AGE, age)
             safety.reconstruct(m.target[i], m.velocity[i], age, m.position[i])
-        elif m.scale[i] == 0.0:
-            m.position[i] = m.origin[
-                i
-            ]  # nobody feels it any more: withdraw the tip, so that the tissue comes to rest
+        elif _has_faded(m, i):
+            # Nobody feels it any more: withdraw the tip, so that the tissue comes to rest.
+            m.position[i] = m.origin[i]
             m.energy[i] = 0.0
         for j in range(3):
             m.step[i, j] = m.applied[i, j]
         flags |= safety.follow(
-            m.position[i], m.applied[i], m.limits[i, WORKSPACE], m.limits[i, MAX_SPEED] * period_s
+            m.position[i],
+            m.applied[i],
+            m.origin[i],
+            m.limits[i, WORKSPACE] / max(1.0, m.frame_scale[i]),  # at the device and in the model
+            m.limits[i, MAX_SPEED] * period_s,
         )
         for j in range(3):
             m.step[i, j] = m.applied[i, j] - m.step[i, j]
@@ -489,10 +508,8 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
         if live:
             if scale < 1.0:
                 flags |= _SOFT_START
-        elif scale > 0.0:
-            flags |= _DECAYING
         else:
-            flags |= _STALE
+            flags |= _DECAYING
         m.scale[i] = scale
         inputs = m.record_inputs[row, i]
         inputs[SEQUENCE] = integers[SEQUENCE]
@@ -551,8 +568,12 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
             period_s,
         )
         flags |= limited
+        # The largest force fades too: of a force far above it, cut to it, the fading would show only at its very end.
         flags |= safety.bound(
-            force, m.previous_force[i], m.limits[i, MAX_FORCE_RATE] * period_s, m.limits[i, MAX_FORCE]
+            force,
+            m.previous_force[i],
+            m.limits[i, MAX_FORCE_RATE] * period_s,
+            m.limits[i, MAX_FORCE] * m.scale[i],
         )
         if not (safety.all_finite(force) and safety.all_finite(m.energy[i : i + 1])):
             # The last word before the device: whatever went wrong above, it feels nothing, and the next client starts
@@ -562,12 +583,15 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
             m.energy[i] = 0.0
             m.scale[i] = 0.0
             flags |= _FAULT
-        m.record_inputs[row, i, CONTACT_FLAGS] |= flags
         motion = m.record_motion[row, i]
         for j in range(3):
             m.previous_force[i, j] = force[j]
             motion[j] = m.applied[i, j]
             motion[3 + j] = force[j]
+        flags |= m.record_inputs[row, i, CONTACT_FLAGS]
+        if flags & _DECAYING and _has_faded(m, i):
+            flags ^= _DECAYING | _STALE
+        m.record_inputs[row, i, CONTACT_FLAGS] = flags
         motion[SCALE] = m.scale[i]
         motion[ENERGY_J] = m.energy[i]
 

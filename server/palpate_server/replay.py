@@ -135,7 +135,8 @@ def compare(session: Session, model: ReducedModel) -> Comparison:
         for i, name in enumerate(names):
             if tick == first:
                 earlier = [since for since, index in terms if index == i and since <= first]
-                _agree(image, i, terms.get((max(earlier, default=-1), i)))
+                state = terms.get((max(earlier, default=-1), i))
+                _agree(image, i, state and state | {"held_since_tick": state["since_tick"]})
             else:
                 _agree(image, i, terms.get((tick, i)))
             lost += not _hand_over(session, memory, i, name, message)
@@ -151,6 +152,8 @@ def _agree(image: Image, contact: int, state: dict[str, Any] | None) -> None:
     if state is None:
         return
     loop.set_limits(image, contact, np.array(Limits(**state["limits"])))
+    if state.get("held_since_tick", state["since_tick"]) != state["since_tick"]:
+        return  # other limits in the middle of a hold: the tip stays where it is
     frame = read_frame(state["frame"])
     loop.set_frame(image, contact, np.array(frame.rotation), frame.scale, np.array(frame.origin_m))
 

@@ -51,6 +51,11 @@ class Limits(NamedTuple):
     max_damping_n_s_per_m: float
 
 
+def least_force_rate(max_force_n: float) -> float:
+    """N/s that any limit of the rate must allow, so that the largest force is gone when the fading is: in DECAY_NS."""
+    return max_force_n * 1e9 / DECAY_NS
+
+
 # The numba compiler reads module constants, not enum members.
 _WORKSPACE_CLAMPED = int(Flags.WORKSPACE_CLAMPED)
 _SPEED_LIMITED = int(Flags.SPEED_LIMITED)
@@ -76,22 +81,22 @@ def is_finite(value: float) -> bool:
 
 
 @compiled
-def follow(target: Floats, applied: Floats, workspace_radius: float, max_step: float) -> int:
+def follow(target: Floats, applied: Floats, origin: Floats, workspace_radius: float, max_step: float) -> int:
     """Move `applied` (3,) towards `target` (3,), no further than `max_step` and not out of the workspace; flags.
 
-    `applied` is changed in place; it stays where it is when `target` has no finite length. All in m.
+    The workspace is a ball around `origin` (3,). `applied` is changed in place; it stays where it is when `target` has no finite length. All in m.
     """
     flags = 0
-    length = math.sqrt(target[0] ** 2 + target[1] ** 2 + target[2] ** 2)
+    x, y, z = target[0] - origin[0], target[1] - origin[1], target[2] - origin[2]
+    length = math.sqrt(x * x + y * y + z * z)
     if not is_finite(length):
         return _WORKSPACE_CLAMPED
-    inside = 1.0
+    wanted_x, wanted_y, wanted_z = target[0], target[1], target[2]
     if length > workspace_radius:
         inside = workspace_radius / length
+        wanted_x, wanted_y, wanted_z = origin[0] + x * inside, origin[1] + y * inside, origin[2] + z * inside
         flags |= _WORKSPACE_CLAMPED
-    dx = target[0] * inside - applied[0]
-    dy = target[1] * inside - applied[1]
-    dz = target[2] * inside - applied[2]
+    dx, dy, dz = wanted_x - applied[0], wanted_y - applied[1], wanted_z - applied[2]
     distance = math.sqrt(dx * dx + dy * dy + dz * dz)
     if distance > max_step:
         share = max_step / distance
@@ -99,8 +104,7 @@ def follow(target: Floats, applied: Floats, workspace_radius: float, max_step: f
         applied[1] += dy * share
         applied[2] += dz * share
         return flags | _SPEED_LIMITED
-    for i in range(3):
-        applied[i] = target[i] * inside
+    applied[0], applied[1], applied[2] = wanted_x, wanted_y, wanted_z
     return flags
 
 
@@ -148,22 +152,26 @@ def keep_passive(
 def bound(force: Floats, previous: Floats, max_change: float, max_magnitude: float) -> int:
     """Limit `force` (3,) in place: its change from `previous` (3,), then its magnitude, directions kept; flags.
 
-    With |previous| <= max_magnitude the result obeys both limits: cutting to a ball brings no two points apart. In N.
+    The rate always holds. With |previous| <= max_magnitude the magnitude holds too: cutting to a ball brings no two
+    points apart. A force above `max_magnitude`, because that was lowered, first comes down straight, as fast as the
+    rate allows; only what is left of the rate is for following. In N.
     """
     flags = 0
-    dx = force[0] - previous[0]
-    dy = force[1] - previous[1]
-    dz = force[2] - previous[2]
+    before = math.sqrt(previous[0] ** 2 + previous[1] ** 2 + previous[2] ** 2)
+    largest = max(max_magnitude, before - max_change)
+    inward, left = 1.0, max_change
+    if before > largest:
+        inward, left = largest / before, max(0.0, max_change - (before - largest))
+    x, y, z = previous[0] * inward, previous[1] * inward, previous[2] * inward
+    dx, dy, dz = force[0] - x, force[1] - y, force[2] - z
     change = math.sqrt(dx * dx + dy * dy + dz * dz)
-    if change > max_change:
-        share = max_change / change
-        force[0] = previous[0] + dx * share
-        force[1] = previous[1] + dy * share
-        force[2] = previous[2] + dz * share
+    if change > left:
+        share = left / change
+        force[0], force[1], force[2] = x + dx * share, y + dy * share, z + dz * share
         flags |= _SLEW_LIMITED
     magnitude = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
-    if magnitude > max_magnitude:
-        share = max_magnitude / magnitude
+    if magnitude > largest:
+        share = largest / magnitude
         for i in range(3):
             force[i] *= share
         flags |= _FORCE_CLAMPED

@@ -388,7 +388,7 @@ class Server:
         tick = loop.set_frame(
             self.image, contact, np.array(frame.rotation), frame.scale, np.array(frame.origin_m)
         )
-        self.leases.terms[name] = Terms(limits, frame, tick)
+        self.leases.terms[name] = Terms(limits, frame, tick, tick)
 
     def _instant_stiffness(self, contact: int) -> float:
         """N/m, the largest over the directions."""
@@ -412,11 +412,18 @@ class Server:
                 raise wire.MalformedMessage("wrong_type", f"{field} is None: expected a number")
             if field != "max_damping_n_s_per_m" and not 0 < value <= ceiling:
                 raise Refused("limit_too_high", f"{field} is {value}: expected above 0, at most {ceiling}")
+            # Of the server's largest force, not the client's own: one that was allowed before may still stand.
+            least = safety.least_force_rate(self.limits.max_force_n)
+            if field == "max_force_rate_n_per_s" and value < least:
+                raise Refused(
+                    "limit_too_low",
+                    f"{field} is {value}: expected at least {least:g}, so that a force can fade in time",
+                )
         for name in held:
             terms = self.leases.terms[name]
             limits = terms.limits._replace(**wanted)
             tick = loop.set_limits(self.image, self._contact_index[name], np.array(limits))
-            self.leases.terms[name] = Terms(limits, terms.frame, tick)
+            self.leases.terms[name] = Terms(limits, terms.frame, tick, terms.held_since_tick)
         return {"contacts": list(held), "limits": limits._asdict()}
 
     def _reset(self, client: str) -> dict[str, Any]:

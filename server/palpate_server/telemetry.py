@@ -98,6 +98,7 @@ def status(
                 "limits": leases.terms[name].limits._asdict(),
                 "frame": asdict(leases.terms[name].frame),
                 "since_tick": leases.terms[name].since_tick,
+                "held_since_tick": leases.terms[name].held_since_tick,
             }
             for index, (name, holder) in enumerate(leases.holders.items())
         },

@@ -292,6 +292,12 @@ def test_a_device_brings_its_limits_its_frame_and_warnings(
         assert answer["limits"] == terms["limits"] | {"max_force_n": 1.5}
         granted, refusal = client.query("control/limits", limits | {"limits": {"max_force_n": 11.0}})
         assert (granted, refusal["reason"]) == (False, "limit_too_high")
+        for too_slow in (199.0, 1e-320):  # the server's 10 N in the 50 ms of the fading are 200 N/s
+            slow = limits | {"limits": {"max_force_rate_n_per_s": too_slow}}
+            granted, refusal = client.query("control/limits", slow)
+            assert (granted, refusal["reason"]) == (False, "limit_too_low")
+            assert "200" in refusal["message"]
+        assert client.query("control/limits", limits | {"limits": {"max_force_rate_n_per_s": 200.0}})[0]
         granted, refusal = client.query("control/limits", limits | {"limits": {"max_torque": 1.0}})
         assert (granted, refusal["reason"]) == (False, "unknown_limit")
 
@@ -436,6 +442,7 @@ def test_a_server_that_cannot_start_says_why_in_one_line(serve: Callable[..., An
         ((str(model), "--zenoh-config", str(unreadable)), "broken.json5"),
         ((str(model), "--zenoh-config", str(tmp_path / "missing.json5")), "no such file"),
         ((str(model), "--session", "a/b"), "a/b"),
+        ((str(model), "--max-force-rate-n-per-s", "1"), "expected at least 200"),
     ):
         code, err = run_server(*arguments)
         assert code == 2

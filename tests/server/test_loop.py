@@ -180,16 +180,114 @@ def test_commands_and_forces_are_in_the_holders_frame(
         np.testing.assert_allclose(force, fade * expected, rtol=0, atol=1e-11)
 
 
-def test_another_frame_leaves_the_tip_where_it_is_in_the_model(memory: loop.Memory) -> None:
-    for i in range(10):
-        command(memory, i, (1e-3, 2e-3, 3e-3))
+USUAL = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
+SPRING_N_PER_M = 1000.0
+
+
+@pytest.fixture
+def spring() -> loop.Memory:
+    """A spring without memory: what it gives is the displacement of this very tick."""
+    nothing = np.zeros(2), np.zeros(2), np.zeros((2, 3)), np.zeros((3, 2))
+    return loop.make_memory(StateSpace(*nothing, SPRING_N_PER_M * np.eye(3)), 1e-3, [USUAL], 1 / 30)
+
+
+def hand_over(memory: loop.Memory, scale: float, origin: tuple[float, float, float]) -> None:
+    """What acquiring does: silence, then the next holder's frame."""
+    image = make_image(memory)
+    loop.forget_command(memory.commands, 0)
+    for _ in range(60):
+        if loop.is_silent(image, 0):
+            break
         tick(memory)
-    rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    loop.set_frame(make_image(memory), 0, rotation, 0.5, np.array([0.1, 0.2, 0.3]))
-    before = memory.displacement.copy()
-    command(memory, 10, tuple(memory.applied[0]))
-    tick(memory)
-    np.testing.assert_allclose(memory.displacement, before, atol=1e-15)
+    assert loop.is_silent(image, 0)
+    loop.set_frame(image, 0, np.eye(3), scale, np.array(origin))
+
+
+def test_the_next_client_starts_at_rest_whatever_the_one_before_did(spring: loop.Memory) -> None:
+    hand_over(spring, 1000.0, (0.0, 0.0, 0.0))
+    for i in range(300):
+        command(spring, i, (0.0, 0.0, 0.09))
+        flags, applied, force, scale = tick(spring)
+        assert np.linalg.norm(spring.displacement) <= USUAL.workspace_radius_m * (1 + 1e-12)
+    assert flags & Flags.WORKSPACE_CLAMPED
+    assert np.linalg.norm(force) == pytest.approx(USUAL.max_force_n)
+    hand_over(spring, 1.0, (0.0, 0.0, 0.0))
+    for i in range(300):
+        command(spring, i, (0.0, 0.0, 0.0))
+        _, applied, force, scale = tick(spring)
+        np.testing.assert_array_equal(applied, 0)
+        np.testing.assert_array_equal(spring.displacement, 0)
+        np.testing.assert_array_equal(force, 0)
+    assert scale == 1
+
+
+def test_the_workspace_is_around_the_frames_origin(spring: loop.Memory) -> None:
+    origin = np.array([5.0, 0.0, 0.0])
+    hand_over(spring, 1.0, (5.0, 0.0, 0.0))
+    for i in range(300):
+        command(spring, i, (5.0, 0.0, 0.0))
+        flags, applied, force, _ = tick(spring)
+        assert not flags & (Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED)
+        np.testing.assert_array_equal(applied, origin)
+        np.testing.assert_array_equal(force, 0)
+    for i in range(300, 400):
+        command(spring, i, (5.0, 0.0, 1e-3))
+        _, _, force, _ = tick(spring)
+    np.testing.assert_allclose(force, (0.0, 0.0, 1e-3 * SPRING_N_PER_M))
+    for i in range(400, 600):
+        command(spring, i, (5.5, 0.0, 0.0))
+        flags, applied, *_ = tick(spring)
+    assert flags & Flags.WORKSPACE_CLAMPED
+    np.testing.assert_allclose(applied, (5.1, 0.0, 0.0))
+    loop.forget_command(spring.commands, 0)
+    for _ in range(200):
+        _, applied, *_ = tick(spring)
+    np.testing.assert_allclose(applied, origin)
+    np.testing.assert_allclose(spring.displacement, 0, atol=1e-14)
+
+
+def test_a_reset_puts_the_tip_to_rest_and_takes_the_force_down_at_the_allowed_rate(
+    spring: loop.Memory,
+) -> None:
+    for i in range(300):
+        command(spring, i, (0.0, 0.0, 0.05))
+        _, _, before, _ = tick(spring)
+    assert np.linalg.norm(before) == pytest.approx(USUAL.max_force_n)
+    loop.reset(make_image(spring))
+    np.testing.assert_array_equal(spring.applied, 0)
+    np.testing.assert_array_equal(spring.displacement, 0)
+    for i in range(300, 320):
+        command(spring, i, (0.0, 0.0, 0.0))
+        _, _, force, _ = tick(spring)
+        assert np.linalg.norm(force - before) <= USUAL.max_force_rate_n_per_s * 1e-3 * (1 + 1e-12)
+        before = force
+    np.testing.assert_array_equal(force, 0)
+
+
+@pytest.mark.parametrize("soft_start_ticks", [20, 100, 300])
+@pytest.mark.parametrize("lowered_to_n", [USUAL.max_force_n, 0.01])
+def test_the_slowest_allowed_rate_lets_every_force_fade_in_time_and_stale_means_zero(
+    spring: loop.Memory, soft_start_ticks: int, lowered_to_n: float
+) -> None:
+    """The model's force is far above the largest one, so that it stands at its limit while its scale already falls."""
+    image = make_image(spring)
+    for i in range(soft_start_ticks):
+        command(spring, i, (0.0, 0.0, 0.1))
+        _, _, before, _ = tick(spring)
+    slowest = safety.least_force_rate(USUAL.max_force_n)
+    terms = USUAL._replace(max_force_n=lowered_to_n, max_force_rate_n_per_s=slowest)
+    loop.set_limits(image, 0, np.array(terms))
+    loop.forget_command(spring.commands, 0)
+    ticks = 0
+    while np.any(before):
+        flags, _, force, _ = tick(spring)
+        ticks += 1
+        assert np.linalg.norm(force - before) <= slowest * 1e-3 + 1e-12
+        assert bool(flags & Flags.STALE) == (not np.any(force))
+        assert bool(flags & Flags.DECAYING) == bool(np.any(force))
+        before = force
+        assert safety.HOLD_NS + ticks * PERIOD_NS < 100_000_000
+    assert ticks <= safety.DECAY_NS // PERIOD_NS + 1
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])

@@ -19,20 +19,25 @@ ROUNDING = 1e-12
 
 
 @settings(deadline=None)
-@given(target=vector, applied=vector, radius=positive, max_step=positive)
+@given(target=vector, applied=vector, origin=vector, radius=positive, max_step=positive)
 def test_the_tip_moves_no_further_than_a_step_and_ends_inside_the_workspace(
-    target: NDArray[np.float64], applied: NDArray[np.float64], radius: float, max_step: float
+    target: NDArray[np.float64],
+    applied: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    radius: float,
+    max_step: float,
 ) -> None:
     size = np.linalg.norm(applied)
     if size > radius:
         applied = applied * (radius / size)
+    applied += origin
     before = applied.copy()
-    flags = safety.follow(target, applied, radius, max_step)
-    assert np.linalg.norm(applied - before) <= max_step * (1 + ROUNDING) + ROUNDING * radius
-    assert np.linalg.norm(applied) <= radius * (1 + ROUNDING)
-    assert bool(flags & Flags.WORKSPACE_CLAMPED) == (
-        math.sqrt(target[0] ** 2 + target[1] ** 2 + target[2] ** 2) > radius
-    )
+    flags = safety.follow(target, applied, origin, radius, max_step)
+    rounding = ROUNDING * (radius + np.abs(origin).max())
+    assert np.linalg.norm(applied - before) <= max_step * (1 + ROUNDING) + rounding
+    assert np.linalg.norm(applied - origin) <= radius + rounding
+    x, y, z = target - origin
+    assert bool(flags & Flags.WORKSPACE_CLAMPED) == (math.sqrt(x * x + y * y + z * z) > radius)
     if not flags:
         np.testing.assert_array_equal(applied, target)
 
@@ -52,6 +57,28 @@ def test_the_force_is_bounded_in_change_and_in_magnitude(
     assert np.linalg.norm(force - previous) <= max_change + ROUNDING * largest
     if not flags:
         np.testing.assert_array_equal(force, wanted)
+
+
+@settings(deadline=None)
+@given(force=vector, previous=vector, max_change=positive, max_magnitude=positive)
+def test_a_force_above_a_lowered_limit_comes_down_at_the_allowed_rate(
+    force: NDArray[np.float64], previous: NDArray[np.float64], max_change: float, max_magnitude: float
+) -> None:
+    rounding = ROUNDING * (np.abs(force).max() + np.abs(previous).max() + max_magnitude)
+    before = np.linalg.norm(previous)
+    safety.bound(force, previous, max_change, max_magnitude)
+    assert np.linalg.norm(force - previous) <= max_change + rounding
+    assert np.linalg.norm(force) <= max(max_magnitude, before - max_change) + rounding
+
+
+def test_a_lowered_limit_of_the_force_is_no_step() -> None:
+    force = np.array([0.0, 0.0, 10.0])
+    forces = [10.0]
+    for _ in range(10):
+        previous, force = force, np.array([0.0, 0.0, 10.0])
+        safety.bound(force, previous, 2.0, 0.05)
+        forces.append(float(force[2]))
+    np.testing.assert_allclose(forces, [10.0, 8.0, 6.0, 4.0, 2.0, *[0.05] * 6], rtol=1e-12)
 
 
 def test_a_silent_client_is_faded_out_linearly_and_faded_in_again_more_slowly() -> None:
