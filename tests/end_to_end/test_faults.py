@@ -17,8 +17,14 @@ import zenoh
 
 from palpate_server import wire
 from palpate_server.round_trips import free_endpoint
+from palpate_server.safety import Flags
 
-MAX_FORCE_N, MAX_STEP_N = 1.0, 2.0  # of the server below; 2000 N/s
+# Of the server below. A press of DEPTH_M (50 N/m when it has settled, more before) goes beyond the largest force, and
+# one tick may change it by a fiftieth of that: the lowest rate that is accepted, so a step beyond it has room to show.
+MAX_FORCE_N, MAX_FORCE_RATE_N_PER_S = 2.0, 40.0
+MAX_STEP_N = MAX_FORCE_RATE_N_PER_S * 1e-3
+DEPTH_M = 0.09
+LIMITS = ("--max-force-n", str(MAX_FORCE_N), "--max-force-rate-n-per-s", str(MAX_FORCE_RATE_N_PER_S))
 
 
 def check(messages: list[dict[str, Any]]) -> None:
@@ -34,9 +40,15 @@ def check(messages: list[dict[str, Any]]) -> None:
         assert step <= MAX_STEP_N * (after["tick"] - before["tick"]) + 1e-9
 
 
+def limits_were_met(messages: list[dict[str, Any]]) -> bool:
+    """Whether the force pressed against both of its limits, without which `check` could not have failed."""
+    flags = [Flags(message["flags"][0]) for message in messages]
+    return any(f & Flags.SLEW_LIMITED for f in flags) and any(f & Flags.FORCE_CLAMPED for f in flags)
+
+
 @pytest.fixture
 def served(serve: Callable[..., Any]) -> Any:
-    return serve("--max-force-n", str(MAX_FORCE_N))
+    return serve(*LIMITS)
 
 
 def test_bursts_of_commands_make_no_more_ticks_than_time_has(
@@ -47,7 +59,7 @@ def test_bursts_of_commands_make_no_more_ticks_than_time_has(
         before, started = client.next_status(), time.monotonic_ns()
         for burst in range(20):
             for _ in range(100):
-                client.command({"tip": [0.0, 0.0, 1e-4 * burst]})
+                client.command({"tip": [0.0, 0.0, DEPTH_M * burst / 20]})
             time.sleep(0.05)
         after = client.next_status()
         ticks = after["ticks"] + after["skipped_ticks"] - before["ticks"] - before["skipped_ticks"]
@@ -57,6 +69,7 @@ def test_bursts_of_commands_make_no_more_ticks_than_time_has(
         assert ticks >= elapsed_ns * 0.998e-6 - 25  # what is missed now is made up for later
         assert after["accepted"] - before["accepted"] == 2000
         check(client.forces)
+        assert limits_were_met(client.forces)
 
 
 def test_a_clients_clock_that_jumps_changes_nothing_but_the_echo(
@@ -69,7 +82,7 @@ def test_a_clients_clock_that_jumps_changes_nothing_but_the_echo(
             message = {
                 "sequence": sequence,
                 "client_time_ns": jumps[sequence % len(jumps)],
-                "displacement_m": {"tip": [0.0, 0.0, 1e-3]},
+                "displacement_m": {"tip": [0.0, 0.0, DEPTH_M]},
             }
             client.put(wire.pack(message))
             time.sleep(0.001)
@@ -78,6 +91,7 @@ def test_a_clients_clock_that_jumps_changes_nothing_but_the_echo(
         answered = [m for m in client.forces if m["sequence"][0] > 0]
         assert all(m["client_time_ns"][0] == jumps[m["sequence"][0] % len(jumps)] for m in answered)
         check(client.forces)
+        assert limits_were_met(client.forces)
 
 
 def test_reordered_and_repeated_commands_never_move_the_tip_back(
@@ -88,7 +102,7 @@ def test_reordered_and_repeated_commands_never_move_the_tip_back(
         assert client.acquire("tip")[0]
         order = [max(1, i + generator.randrange(-20, 1)) for i in range(1, 500)]
         for sequence in order:
-            client.command({"tip": [0.0, 0.0, 1e-5 * sequence]}, sequence=sequence)
+            client.command({"tip": [0.0, 0.0, DEPTH_M * sequence / 500]}, sequence=sequence)
             time.sleep(0.0005)
         status = client.next_status()
         newest = list(itertools.accumulate(order, max))
@@ -104,8 +118,8 @@ def test_of_two_clients_fighting_for_a_contact_one_moves_it(served: Any, connect
     with connect(served.endpoint) as first, connect(served.endpoint) as second:
         assert first.acquire("tip")[0]
         for i in range(200):
-            first.command({"tip": [0.0, 0.0, 1e-3]})
-            second.command({"tip": [0.0, 0.0, -1e-3]}, sequence=1000 + i)
+            first.command({"tip": [0.0, 0.0, DEPTH_M]})
+            second.command({"tip": [0.0, 0.0, -DEPTH_M]}, sequence=1000 + i)
             if i % 50 == 0:
                 granted, refusal = second.acquire("tip")
                 assert (granted, refusal["reason"]) == (False, "held")
@@ -158,7 +172,7 @@ def test_a_router_that_is_restarted_fades_the_force_and_lets_the_client_come_bac
                 }
             )
         )
-        served = serve("--max-force-n", str(MAX_FORCE_N), "--zenoh-config", str(config), listen=False)
+        served = serve(*LIMITS, "--zenoh-config", str(config), listen=False)
         with connect(endpoint) as client:
             assert client.acquire("tip")[0]
             for _ in range(400):
