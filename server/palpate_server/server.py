@@ -33,6 +33,7 @@ SURFACE_PERIOD_S = 1 / 30
 FADE_OVER_S = 0.5  # from one model to another
 MAX_UNSENT = 100  # ticks whose forces are still worth sending; what is older is dropped and counted
 _ALIVE_TIMEOUT_S = 1.0
+_LONGEST_FILE_NAME = 255  # bytes, on the usual file systems
 
 
 class Server:
@@ -306,6 +307,10 @@ class Server:
             except Refused as error:
                 refusal = {"reason": error.reason, "message": str(error)}
                 query.reply_err(wire.pack(refusal), encoding=wire.ENCODING)
+            except Exception:  # a mistake of ours: whoever waits for the answer shall not wait in vain
+                log.exception("a query could not be answered")
+                refusal = {"reason": "internal", "message": "the server failed at it; its log says why"}
+                query.reply_err(wire.pack(refusal), encoding=wire.ENCODING)
             else:
                 query.reply(query.key_expr, wire.pack(reply), encoding=wire.ENCODING)
 
@@ -338,7 +343,7 @@ class Server:
         except ValueError as error:
             raise wire.MalformedMessage("wrong_type", str(error)) from error
         device = request.get("device")
-        if device is not None and device not in PROFILES:
+        if device is not None and not (isinstance(device, str) and device in PROFILES):
             raise Refused("unknown_device", f"device is {device!r}: there are {', '.join(PROFILES)}")
         round_trip_s = _optional_number(request, "round_trip_s")
         damping = _optional_number(request, "device_damping_n_s_per_m")
@@ -469,13 +474,20 @@ class Server:
 
     def _read_model(self, name: object) -> ReducedModel:
         if not isinstance(name, str) or Path(name).name != name or name in ("", ".", ".."):
-            raise Refused("bad_model", f"model is {name!r}: expected a file's name, without a folder")
+            raise Refused(
+                "bad_model", f"model is {str(name)[:300]!r}: expected a file's name, without a folder"
+            )
+        if len(os.fsencode(name)) > _LONGEST_FILE_NAME or "\0" in name:
+            raise Refused(
+                "bad_model",
+                f"model is {name[:40]!r}...: expected a file's name of at most {_LONGEST_FILE_NAME} bytes",
+            )
         path = self._models / name
-        if path.is_symlink() and path.resolve().parent != self._models.resolve():
-            raise Refused("bad_model", f"{name}: leads out of the folder of models")
         try:
+            if path.is_symlink() and path.resolve().parent != self._models.resolve():
+                raise Refused("bad_model", f"{name}: leads out of the folder of models")
             model = load_model(path)
-        except (OSError, ModelFileError) as error:
+        except (OSError, RuntimeError, ModelFileError) as error:  # RuntimeError: links in a circle
             raise Refused("bad_model", str(error).replace(f"{self._models}/", "")) from error
         names = [contact.name for contact in model.contacts]
         if names != self.names:

@@ -247,6 +247,8 @@ def test_old_sequences_and_others_contacts_are_refused(
         ("acquire", {"client": "nobody", "contacts": ["tip"]}, "not_alive"),
         ("acquire", {"client": "a/b", "contacts": ["tip"]}, "wrong_type"),
         ("acquire", {"client": "nobody", "contacts": "tip"}, "wrong_type"),
+        ("acquire", {"client": "nobody", "contacts": ["tip"], "device": ["omega"]}, "unknown_device"),
+        ("acquire", {"client": "nobody", "contacts": ["tip"], "device": {}}, "unknown_device"),
         ("explode", {"client": "nobody"}, "unknown_action"),
     ],
 )
@@ -326,6 +328,7 @@ def test_a_model_is_exchanged_while_a_client_presses_and_a_bad_file_leaves_the_o
     outside = tmp_path.parent / "outside.npz"
     save_model(spring_mass_model(1, 5), outside)
     (tmp_path / "link.npz").symlink_to(outside)
+    (tmp_path / "circle.npz").symlink_to(tmp_path / "circle.npz")
     with connect(served.endpoint) as client:
         assert client.acquire("tip")[0]
         stop = threading.Event()
@@ -344,6 +347,9 @@ def test_a_model_is_exchanged_while_a_client_presses_and_a_bad_file_leaves_the_o
                 "two.npz",
                 "missing.npz",
                 "link.npz",
+                "circle.npz",
+                "x" * 5000,
+                "zero\0.npz",
                 "../outside.npz",
                 str(outside),
                 "",
