@@ -354,15 +354,15 @@ class Server:
 
         limits, warnings = self.limits, []
         for name in contacts:
-            contact = self._contact_index[name]
             if device is not None:
                 limits = limits_for(PROFILES[device], self.limits)
-                stiffness = self._instant_stiffness(contact) * frame.scale**2
+                stiffness = self._instant_stiffness(self._contact_index[name]) * frame.scale**2
                 warnings += stiffness_warnings(
                     PROFILES[device], stiffness, self.model.period_s, round_trip_s, damping
                 )
-            self._silence(contact)
-            self._last_sequence[contact] = -1
+        self._silence(contacts)
+        for name in contacts:
+            self._last_sequence[self._contact_index[name]] = -1
             self._set_terms(name, limits, frame)
             self.leases.holders[name] = client
         return {
@@ -378,12 +378,21 @@ class Server:
         if not any(reply.ok is not None for reply in replies):
             raise Refused("not_alive", f"client {client!r} has no liveliness token at {token}")
 
-    def _silence(self, contact: int) -> None:
-        """Let a contact's force fade to zero, as after a client that has gone, and wait for it."""
-        loop.forget_command(self.memory.commands, contact)
+    def _silence(self, contacts: list[str]) -> None:
+        """Let the contacts' forces fade to zero, as after a client that has gone, and wait for it.
+
+        Until it is over nobody holds them, so that no command is heard. Refused when one does not fade: then they are
+        held as before.
+        """
+        before = {name: self.leases.holders[name] for name in contacts}
+        self.leases.holders |= dict.fromkeys(contacts)
+        indices = [self._contact_index[name] for name in contacts]
+        for contact in indices:
+            loop.forget_command(self.memory.commands, contact)
         give_up = time.monotonic() + 10 * safety.DECAY_NS * 1e-9
-        while not loop.is_silent(self.image, contact):
+        while not all(loop.is_silent(self.image, contact) for contact in indices):
             if time.monotonic() > give_up:
+                self.leases.holders |= before
                 raise Refused("busy", "the force did not fade in time: the server is overloaded")
             time.sleep(self.model.period_s)
 

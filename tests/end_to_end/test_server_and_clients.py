@@ -304,6 +304,32 @@ def test_a_device_brings_its_limits_its_frame_and_warnings(
         assert (granted, refusal["reason"]) == (False, "unknown_limit")
 
 
+def test_a_client_that_goes_on_commanding_may_acquire_its_contact_again(
+    serve: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve(n_contacts=2)
+    with connect(served.endpoint) as client:
+        assert client.acquire("tip")[0]
+        stop = threading.Event()
+
+        def press() -> None:
+            while not stop.wait(0.001):
+                client.command({"tip": [0.0, 0.0, -0.004]})
+
+        thread = threading.Thread(target=press)
+        thread.start()
+        try:
+            wait_until(lambda: client.forces[-1]["force_scale"][0] == 1)
+            granted, answer = client.acquire("tip1", "tip")
+            assert granted, answer
+            wait_until(lambda: client.forces[-1]["force_scale"][0] == 1)
+        finally:
+            stop.set()
+            thread.join()
+        contacts = client.next_status()["contacts"]
+        assert [contacts[name]["holder"] for name in ("tip", "tip1")] == [client.name] * 2
+
+
 def test_only_who_is_alone_may_reset_the_model(
     serve: Callable[..., Any], connect: Callable[..., Any]
 ) -> None:
