@@ -103,10 +103,10 @@ class Connection:
         `wishes` as in docs/wire.md: device, frame, round_trip_s, device_damping_n_s_per_m. The answer has the limits
         that hold for us, and warnings to show to the user.
         """
-        return self.query("control/acquire", {"client": self.name, "contacts": list(contacts), **wishes})
+        return self.query(f"control/{self.name}/acquire", {"contacts": list(contacts), **wishes})
 
     def release(self):
-        return self.query("control/release", {"client": self.name})
+        return self.query(f"control/{self.name}/release")
 
     def command(self, displacement_m, **more):
         """The next command: where the tips are, {contact: [x, y, z]}, m from rest, in our frame.

@@ -97,9 +97,10 @@ def through_a_model(
 def holding(session: zenoh.Session, keys: wire.Keys, contact: str) -> Iterator[None]:
     """Hold a contact as the client of this module."""
     token = session.liveliness().declare_token(keys.client(_CLIENT))
-    request = wire.pack({"client": _CLIENT, "contacts": [contact]})
+    request = wire.pack({"contacts": [contact]})
     give_up = time.monotonic() + _START_S
-    while not any(reply.ok for reply in session.get(keys.control("acquire"), payload=request, timeout=2.0)):
+    acquire = keys.control(_CLIENT, "acquire")
+    while not any(reply.ok for reply in session.get(acquire, payload=request, timeout=2.0)):
         if time.monotonic() > give_up:
             raise transport.TransportError(f"contact {contact} could not be acquired")
         time.sleep(0.05)

@@ -108,7 +108,7 @@ class Server:
         self._declared: list[Any] = [
             session.declare_queryable(keys.describe, self._later(self._answer_describe)),
             session.declare_queryable(keys.geometry, self._later(self._answer_geometry)),
-            session.declare_queryable(keys.control("*"), self._later(self._answer_control)),
+            session.declare_queryable(keys.control("*", "*"), self._later(self._answer_control)),
             session.liveliness().declare_subscriber(keys.client("*"), self._later(self._on_liveliness)),
             session.declare_subscriber(keys.command("*"), self._on_command),
         ]
@@ -292,7 +292,7 @@ class Server:
             query.reply(self.keys.geometry, payload, encoding=wire.ENCODING)
 
     def _answer_control(self, query: zenoh.Query) -> None:
-        if wire.last_chunk(str(query.key_expr)) == "load":  # takes its time, and changes no lease
+        if wire.client_and_action(str(query.key_expr))[1] == "load":  # takes its time, and changes no lease
             threading.Thread(target=self._answer_action, args=(query,), name="load", daemon=True).start()
         else:
             self._answer_action(query)
@@ -300,7 +300,8 @@ class Server:
     def _answer_action(self, query: zenoh.Query) -> None:
         with query:
             try:
-                reply = self._carry_out(wire.last_chunk(str(query.key_expr)), _request(query))
+                client, action = wire.client_and_action(str(query.key_expr))
+                reply = self._carry_out(client, action, _request(query))
             except wire.MalformedMessage as error:
                 refusal = {"reason": error.reason, "message": str(error)}
                 query.reply_err(wire.pack(refusal), encoding=wire.ENCODING)
@@ -314,13 +315,11 @@ class Server:
             else:
                 query.reply(query.key_expr, wire.pack(reply), encoding=wire.ENCODING)
 
-    def _carry_out(self, action: str, request: dict[str, Any]) -> dict[str, Any]:
-        client = request.get("client")
+    def _carry_out(self, client: str, action: str, request: dict[str, Any]) -> dict[str, Any]:
         if not wire.is_name(client):
             raise wire.MalformedMessage(
-                "wrong_type", f"client is {client!r}: expected 1 to 64 of A-Z a-z 0-9 _ -"
+                "wrong_type", f"the client in the key is {client!r}: expected 1 to 64 of A-Z a-z 0-9 _ -"
             )
-        assert isinstance(client, str)
         if action == "acquire":
             return self._acquire(client, request)
         if action == "release":
@@ -598,7 +597,7 @@ def _optional_number(request: dict[str, Any], field: str) -> float | None:
 def _request(query: zenoh.Query) -> dict[str, Any]:
     payload = query.payload
     if payload is None:
-        raise wire.MalformedMessage("missing_field", "the query has no payload: expected a map")
+        return {}
     if len(payload) > wire.MAX_REQUEST_BYTES:
         raise wire.MalformedMessage("too_large", f"payload has {len(payload)} bytes")
     return wire.unpack_map(payload.to_bytes(), wire.MAX_REQUEST_BYTES)

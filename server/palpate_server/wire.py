@@ -91,8 +91,9 @@ class Keys:
     def geometry(self) -> str:
         return f"{self.prefix}/geometry"
 
-    def control(self, action: str) -> str:
-        return f"{self.prefix}/control/{action}"
+    def control(self, client: str, action: str) -> str:
+        """The client is in the key, so that access control can bind a name to a certificate."""
+        return f"{self.prefix}/control/{client}/{action}"
 
 
 class Command(NamedTuple):
@@ -116,6 +117,11 @@ def is_name(text: object) -> bool:
 
 def last_chunk(key: str) -> str:
     return key.rpartition("/")[2]
+
+
+def client_and_action(control_key: str) -> tuple[str, str]:
+    _, client, action = control_key.rsplit("/", 2)
+    return client, action
 
 
 def pack(message: Mapping[str, Any]) -> bytes:

@@ -89,7 +89,10 @@ class RawClient:
         raise AssertionError(f"no answer to {key}")
 
     def acquire(self, *contacts: str) -> tuple[bool, dict[str, Any]]:
-        return self.query("control/acquire", {"client": self.name, "contacts": list(contacts)})
+        return self.control("acquire", {"contacts": list(contacts)})
+
+    def control(self, action: str, request: object = None) -> tuple[bool, dict[str, Any]]:
+        return self.query(f"control/{self.name}/{action}", request)
 
     def put(self, payload: bytes) -> None:
         self.session.put(

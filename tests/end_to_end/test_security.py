@@ -106,8 +106,8 @@ def test_an_observer_hears_forces_but_cannot_move_the_tool(folder: Path) -> None
             assert time.monotonic() < give_up
             time.sleep(0.01)
         session.liveliness().declare_token(KEYS.client("intruder"))
-        request = wire.pack({"client": "intruder", "contacts": ["tip"]})
-        replies = list(session.get(KEYS.control("acquire"), payload=request, timeout=1.0))
+        request = wire.pack({"contacts": ["tip"]})
+        replies = list(session.get(KEYS.control("intruder", "acquire"), payload=request, timeout=1.0))
         assert not any(reply.ok for reply in replies)
         before = statuses[-1]
         command = {"sequence": 1, "client_time_ns": 1, "displacement_m": {"tip": [0.0, 0.0, 0.001]}}

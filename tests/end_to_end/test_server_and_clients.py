@@ -237,27 +237,30 @@ def test_old_sequences_and_others_contacts_are_refused(
         assert status["accepted"] == 1
         assert status["refused"]["old_sequence"] == 2
         assert status["refused"]["not_holder"] == 1
-        assert first.query("control/release", {"client": first.name}) == (True, {"contacts": ["tip"]})
+        assert first.control("release") == (True, {"contacts": ["tip"]})
         assert second.acquire("tip")[0]
 
 
 @pytest.mark.parametrize(
-    ("action", "request_", "reason"),
+    ("key", "request_", "reason"),
     [
-        ("acquire", {"client": "nobody", "contacts": ["tip"]}, "not_alive"),
-        ("acquire", {"client": "a/b", "contacts": ["tip"]}, "wrong_type"),
-        ("acquire", {"client": "nobody", "contacts": "tip"}, "wrong_type"),
-        ("acquire", {"client": "nobody", "contacts": ["tip"], "device": ["omega"]}, "unknown_device"),
-        ("acquire", {"client": "nobody", "contacts": ["tip"], "device": {}}, "unknown_device"),
-        ("explode", {"client": "nobody"}, "unknown_action"),
+        ("nobody/acquire", {"contacts": ["tip"]}, "not_alive"),
+        ("no.body/acquire", {"contacts": ["tip"]}, "wrong_type"),
+        ("*/acquire", {"contacts": ["tip"]}, "wrong_type"),
+        ("nobody/acquire", {"contacts": "tip"}, "wrong_type"),
+        ("nobody/acquire", None, "wrong_type"),
+        ("nobody/acquire", [1], "not_a_map"),
+        ("nobody/acquire", {"contacts": ["tip"], "device": ["omega"]}, "unknown_device"),
+        ("nobody/acquire", {"contacts": ["tip"], "device": {}}, "unknown_device"),
+        ("nobody/explode", None, "unknown_action"),
     ],
 )
 def test_every_refusal_carries_its_reason(
-    serve: Callable[..., Any], connect: Callable[..., Any], action: str, request_: object, reason: str
+    serve: Callable[..., Any], connect: Callable[..., Any], key: str, request_: object, reason: str
 ) -> None:
     served = serve()
     with connect(served.endpoint) as client:
-        granted, refusal = client.query(f"control/{action}", request_)
+        granted, refusal = client.query(f"control/{key}", request_)
         assert not granted
         assert refusal["reason"] == reason
         assert refusal["message"]
@@ -268,9 +271,9 @@ def test_a_device_brings_its_limits_its_frame_and_warnings(
 ) -> None:
     served = serve()
     with connect(served.endpoint) as client:
-        request = {"client": client.name, "contacts": ["tip"], "device": "touch"}
+        request = {"contacts": ["tip"], "device": "touch"}
         request |= {"round_trip_s": 2e-3, "device_damping_n_s_per_m": 0.01, "frame": {"scale": 2.0}}
-        granted, terms = client.query("control/acquire", request)
+        granted, terms = client.control("acquire", request)
         assert granted
         assert terms["limits"]["max_force_n"] == 3.3
         assert terms["frame"]["scale"] == 2.0
@@ -280,27 +283,27 @@ def test_a_device_brings_its_limits_its_frame_and_warnings(
         assert status["limits"] == terms["limits"]
         assert status["frame"]["scale"] == 2.0
 
-        granted, refusal = client.query("control/acquire", request | {"device": "hammer"})
+        granted, refusal = client.control("acquire", request | {"device": "hammer"})
         assert (granted, refusal["reason"]) == (False, "unknown_device")
-        granted, refusal = client.query("control/acquire", request | {"frame": {"scale": -1}})
+        granted, refusal = client.control("acquire", request | {"frame": {"scale": -1}})
         assert (granted, refusal["reason"]) == (False, "wrong_type")
-        nothing = {"client": client.name, "limits": {"max_damping_n_s_per_m": None}}
-        granted, refusal = client.query("control/limits", nothing)
+        nothing = {"limits": {"max_damping_n_s_per_m": None}}
+        granted, refusal = client.control("limits", nothing)
         assert (granted, refusal["reason"]) == (False, "wrong_type")
 
-        limits = {"client": client.name, "limits": {"max_force_n": 1.5}}
-        granted, answer = client.query("control/limits", limits)
+        limits = {"limits": {"max_force_n": 1.5}}
+        granted, answer = client.control("limits", limits)
         assert granted
         assert answer["limits"] == terms["limits"] | {"max_force_n": 1.5}
-        granted, refusal = client.query("control/limits", limits | {"limits": {"max_force_n": 11.0}})
+        granted, refusal = client.control("limits", limits | {"limits": {"max_force_n": 11.0}})
         assert (granted, refusal["reason"]) == (False, "limit_too_high")
         for too_slow in (199.0, 1e-320):  # the server's 10 N in the 50 ms of the fading are 200 N/s
             slow = limits | {"limits": {"max_force_rate_n_per_s": too_slow}}
-            granted, refusal = client.query("control/limits", slow)
+            granted, refusal = client.control("limits", slow)
             assert (granted, refusal["reason"]) == (False, "limit_too_low")
             assert "200" in refusal["message"]
-        assert client.query("control/limits", limits | {"limits": {"max_force_rate_n_per_s": 200.0}})[0]
-        granted, refusal = client.query("control/limits", limits | {"limits": {"max_torque": 1.0}})
+        assert client.control("limits", limits | {"limits": {"max_force_rate_n_per_s": 200.0}})[0]
+        granted, refusal = client.control("limits", limits | {"limits": {"max_torque": 1.0}})
         assert (granted, refusal["reason"]) == (False, "unknown_limit")
 
 
@@ -335,12 +338,12 @@ def test_only_who_is_alone_may_reset_the_model(
 ) -> None:
     served = serve(n_contacts=2)
     with connect(served.endpoint) as first, connect(served.endpoint) as second:
-        granted, refusal = first.query("control/reset", {"client": first.name})
+        granted, refusal = first.control("reset")
         assert (granted, refusal["reason"]) == (False, "not_holder")
         assert first.acquire("tip")[0]
-        assert first.query("control/reset", {"client": first.name})[0]
+        assert first.control("reset")[0]
         assert second.acquire("tip1")[0]
-        granted, refusal = first.query("control/reset", {"client": first.name})
+        granted, refusal = first.control("reset")
         assert (granted, refusal["reason"]) == (False, "held")
 
 
@@ -381,12 +384,11 @@ def test_a_model_is_exchanged_while_a_client_presses_and_a_bad_file_leaves_the_o
                 "",
                 3,
             ):
-                granted, refusal = client.query("control/load", {"client": client.name, "model": name})
+                granted, refusal = client.control("load", {"model": name})
                 assert (granted, refusal["reason"]) == (False, "bad_model")
             assert client.query("describe")[1]["model"]["name"] == "masses on springs"
             first = len(client.forces)
-            request = {"client": client.name, "model": "other.npz"}
-            assert client.query("control/load", request) == (True, {"model": "other", "order": 70})
+            assert client.control("load", {"model": "other.npz"}) == (True, {"model": "other", "order": 70})
             last = len(client.forces)
             after = client.next_status()
         finally:

@@ -21,8 +21,8 @@ from palpate_server.server import Server
 class Query:
     """As much of a Zenoh query as an answer needs; keeps what it was answered."""
 
-    def __init__(self, action: str, request: object) -> None:
-        self.key_expr = f"palpate/test/control/{action}"
+    def __init__(self, client: str, action: str, request: object) -> None:
+        self.key_expr = f"palpate/test/control/{client}/{action}"
         self.payload = self
         self._request = msgpack.packb(request)
         self.refusals: list[dict[str, Any]] = []
@@ -52,7 +52,7 @@ def server(make_spring_mass_model: Callable[..., ReducedModel], tmp_path: Path) 
 
 
 def test_a_mistake_of_the_servers_is_answered_too(server: Server, caplog: pytest.LogCaptureFixture) -> None:
-    query: Any = Query("acquire", {"client": "first", "contacts": ["tip"]})
+    query: Any = Query("first", "acquire", {"contacts": ["tip"]})
     server._answer_action(query)  # without a session it can't find out whether the client is alive
     assert [refusal["reason"] for refusal in query.refusals] == ["internal"]
     assert "AttributeError" in caplog.text
@@ -65,13 +65,13 @@ def test_acquiring_gives_all_contacts_or_leaves_all_as_they_were(
     server.leases.holders["tip1"] = "first"
     before = dict(server.leases.holders), dict(server.leases.terms)
     server.memory.scale[1] = 1.0  # and no loop runs that could let it fade
-    request = {"client": "first", "contacts": ["tip", "tip1"], "frame": {"scale": 2.0}}
+    request = {"contacts": ["tip", "tip1"], "frame": {"scale": 2.0}}
     with pytest.raises(Refused, match="fade") as refusal:
-        server._carry_out("acquire", request)
+        server._carry_out("first", "acquire", request)
     assert refusal.value.reason == "busy"
     assert (server.leases.holders, server.leases.terms) == before
     server.memory.scale[1] = 0.0
-    assert server._carry_out("acquire", request)["contacts"] == ["tip", "tip1"]
+    assert server._carry_out("first", "acquire", request)["contacts"] == ["tip", "tip1"]
     assert server.leases.holders == {"tip": "first", "tip1": "first"}
 
 
@@ -89,6 +89,6 @@ def test_while_forces_fade_for_a_new_hold_no_command_is_heard(
 
     monkeypatch.setattr(server_module.loop, "is_silent", listen)
     monkeypatch.setattr(server, "_check_alive", lambda client: None)
-    server._carry_out("acquire", {"client": "first", "contacts": ["tip", "tip1"]})
+    server._carry_out("first", "acquire", {"contacts": ["tip", "tip1"]})
     assert heard == ["not_holder", "not_holder"]
     assert server._why_refused(command, "first") is None

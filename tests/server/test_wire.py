@@ -182,7 +182,7 @@ def test_the_page_lists_the_keys_of_the_code() -> None:
         keys.surface,
         keys.describe,
         keys.geometry,
-        keys.control("ACTION"),
+        keys.control("CLIENT", "ACTION"),
     }
     assert {row[0].strip("`") for row in _table("Keys")} == expected
 
