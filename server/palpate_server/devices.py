@@ -33,6 +33,7 @@ PROFILES = {
         DeviceProfile("omega", 12.0, 5000.0, 30.0, 0.075, f"{_CHAI3D}: omega.3, omega.6, omega.7"),
         DeviceProfile("delta", 20.0, 5000.0, 30.0, 0.15, f"{_CHAI3D}: delta.3, delta.6"),
         DeviceProfile("sigma", 12.0, 4000.0, 30.0, 0.075, f"{_CHAI3D}: sigma.7"),
+        DeviceProfile("lambda", 12.0, 8000.0, 30.0, 0.1125, f"{_CHAI3D}: lambda.7"),
         DeviceProfile("falcon", 8.0, 3000.0, 20.0, 0.04, _CHAI3D),
         DeviceProfile("inverse3", 10.0, 1000.0, 6.0, 0.15, "Haply's CHAI3D device class for the Inverse3"),
     )

@@ -26,6 +26,11 @@ def test_every_profile_says_where_its_numbers_are_from_and_the_generic_one_is_be
         assert profile.max_damping_n_s_per_m >= GENERIC.max_damping_n_s_per_m
 
 
+def test_the_device_families_of_the_field_have_a_profile() -> None:
+    families = {"touch", "phantom-omni", "omega", "delta", "sigma", "lambda", "falcon", "inverse3", "generic"}
+    assert families <= PROFILES.keys()
+
+
 @pytest.mark.parametrize(
     ("stiffness", "round_trip", "damping", "count"),
     [
