@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
-import math
 import queue
 import signal
 import sys
@@ -20,83 +18,13 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
 
-import msgpack
 import zenoh
-from mcap.writer import CompressionType, Writer
 
 from palpate_server import transport, wire
+from palpate_server.recording import Recording
 
-PROFILE = "palpate"
-_CHUNK_BYTES = 64 * 1024  # a crash loses no more than this
 _QUERY_TIMEOUT_S = 3.0
-_NUMBERS = {"type": "array", "items": {"type": "number"}}
-_VECTORS = {"type": "array", "items": _NUMBERS}
-_SCHEMAS: dict[str, dict[str, Any]] = {
-    "command": {
-        "sequence": {"type": "integer"},
-        "client_time_ns": {"type": "integer"},
-        "displacement_m": {"type": "object"},
-        "velocity_m_per_s": {"type": "object"},
-        "rendered_tick": {"type": "integer"},
-    },
-    "force": {
-        "tick": {"type": "integer"},
-        "server_time_ns": {"type": "integer"},
-        "sequence": _NUMBERS,
-        "client_time_ns": _NUMBERS,
-        "input_age_ns": _NUMBERS,
-        "flags": _NUMBERS,
-        "displacement_m": _VECTORS,
-        "force_n": _VECTORS,
-        "force_scale": _NUMBERS,
-        "energy_j": _NUMBERS,
-    },
-    "status": {"state": {"type": "string"}, "ticks": {"type": "integer"}},
-    "describe": {"session": {"type": "string"}, "period_s": {"type": "number"}},
-}
-
-
-class Recording:
-    """An MCAP file that is being written; one channel a key, its schema named after the kind of message."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.LZ4)
-        self._writer.start(profile=PROFILE, library="palpate")
-        self._schemas = {
-            kind: self._writer.register_schema(
-                name=f"palpate.{kind}",
-                encoding="jsonschema",
-                data=json.dumps({"type": "object", "properties": properties}).encode(),
-            )
-            for kind, properties in _SCHEMAS.items()
-        }
-        self._channels: dict[str, int] = {}
-        self.messages = 0
-
-    def add(self, kind: str, key: str, time_ns: int, message: dict[str, Any]) -> None:
-        if key not in self._channels:
-            self._channels[key] = self._writer.register_channel(
-                topic=key, message_encoding="json", schema_id=self._schemas[kind]
-            )
-        data = json.dumps(_plain(message), allow_nan=False).encode()
-        self._writer.add_message(self._channels[key], log_time=time_ns, data=data, publish_time=time_ns)
-        self.messages += 1
-
-    def finish(self) -> None:
-        self._writer.finish()  # type: ignore[no-untyped-call]
-
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold: numbers that are not finite (in a command that was refused) become null."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    if isinstance(value, bytes):
-        return value.hex()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def record(session: zenoh.Session, keys: wire.Keys, recording: Recording, stop: threading.Event) -> None:
@@ -115,12 +43,8 @@ def record(session: zenoh.Session, keys: wire.Keys, recording: Recording, stop: 
     ]
 
     def write(item: tuple[str, str, int, bytes]) -> None:
-        kind, key, time_ns, payload = item
-        try:
-            message = wire.unpack_map(payload, wire.MAX_RECORDED_BYTES)
-        except wire.MalformedMessage:
-            return  # the server counts them
-        recording.add(kind, key, time_ns, message)
+        if len(item[-1]) <= wire.MAX_RECORDED_BYTES:
+            recording.add(*item)
 
     try:
         recording.add("describe", keys.describe, time.time_ns(), _describe(session, keys))
@@ -134,12 +58,12 @@ def record(session: zenoh.Session, keys: wire.Keys, recording: Recording, stop: 
         write(heard.get())
 
 
-def _describe(session: zenoh.Session, keys: wire.Keys) -> dict[str, Any]:
+def _describe(session: zenoh.Session, keys: wire.Keys) -> bytes:
     give_up = time.monotonic() + _QUERY_TIMEOUT_S
     while time.monotonic() < give_up:  # right after connecting, its queryables may not be known here yet
         for reply in session.get(keys.describe, timeout=_QUERY_TIMEOUT_S):
             if reply.ok is not None:
-                return dict(msgpack.unpackb(reply.ok.payload.to_bytes()))
+                return reply.ok.payload.to_bytes()
         time.sleep(0.05)
     raise transport.TransportError(f"no server answers for {keys.describe}")
 
