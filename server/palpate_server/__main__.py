@@ -20,7 +20,7 @@ import zenoh
 from palpate.model import ModelFileError, load_model
 from palpate_server import transport, wire
 from palpate_server.safety import Limits, least_force_rate
-from palpate_server.server import serve
+from palpate_server.server import FASTEST_SURFACE_HZ, USUAL_SURFACE_HZ, serve
 
 EXIT_REFUSED = 2
 
@@ -71,6 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 announce,
                 options.models or options.model.parent,
                 options.black_box,
+                options.surface_hz,
+                options.cpu,
             )
     except (OSError, ModelFileError, transport.TransportError, ValueError) as error:
         print(f"palpate serve: {error}", file=sys.stderr)
@@ -116,6 +118,19 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FOLDER",
         help="write the last two seconds there after a fault, a stale input or a storm of limits",
     )
+    parser.add_argument(
+        "--surface-hz",
+        type=_surface_rate,
+        default=USUAL_SURFACE_HZ,
+        metavar="HZ",
+        help="how often the surface is sent while somebody listens, up to 60 (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--cpu",
+        type=int,
+        metavar="N",
+        help="keep the threads that run ticks on this processor (default: where the system puts them)",
+    )
     limits = parser.add_argument_group("limits", "what no client can exceed, for each contact")
     limits.add_argument(
         "--max-force-n", type=_positive, default=10.0, metavar="N", help="(default: %(default)s)"
@@ -142,6 +157,13 @@ def _parser() -> argparse.ArgumentParser:
         help="longest displacement of a tip (default: %(default)s)",
     )
     return parser
+
+
+def _surface_rate(text: str) -> float:
+    value = _positive(text)
+    if value > FASTEST_SURFACE_HZ:
+        raise argparse.ArgumentTypeError(f"{text} is above {FASTEST_SURFACE_HZ:g}")
+    return value
 
 
 def _positive(text: str) -> float:

@@ -18,7 +18,7 @@ log = logging.getLogger("palpate_server")
 KEPT_TICKS = 2000
 STORM_TICKS = 1000  # in so many ticks,
 STORM_SHARE = 0.5  # so large a share with a limit met is a storm
-QUIET_S = 10.0  # between two files
+QUIET_S = 10.0  # between two files of one cause
 
 _LIMITED = int(
     Flags.WORKSPACE_CLAMPED
@@ -33,7 +33,7 @@ class BlackBox:
     """Looks at new ticks each time `examine` is called (some times a second) and writes a file when there is cause.
 
     Causes: `fault` (a force that was not finite), `stale` (a contact's force had to fade to zero), `limits` (half of
-    the last second's ticks met a limit). One file in QUIET_S; the writing is done by a thread of its own.
+    the last second's ticks met a limit). One file of each cause in QUIET_S; the writing is done by a thread of its own.
     """
 
     def __init__(self, folder: Path, session: str, contacts: Sequence[str], memory: loop.Memory) -> None:
@@ -42,7 +42,7 @@ class BlackBox:
         self.contacts = list(contacts)
         self.memory = memory
         self._seen = 0
-        self._last_file_s = -np.inf
+        self._last_file_s: dict[str, float] = {}
 
     def examine(self) -> threading.Thread | None:
         """The thread that writes a file, when there was cause for one."""
@@ -51,9 +51,9 @@ class BlackBox:
         cause = self._cause(first, head)
         self._seen = head
         now = time.monotonic()
-        if cause is None or now - self._last_file_s < QUIET_S:
+        if cause is None or now - self._last_file_s.get(cause, -np.inf) < QUIET_S:
             return None
-        self._last_file_s = now
+        self._last_file_s[cause] = now
         thread = threading.Thread(target=self._write, args=(cause, head), name="black box", daemon=True)
         thread.start()
         return thread

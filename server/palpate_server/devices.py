@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from palpate.model import ReducedModel
 from palpate_server.safety import Limits
 
 _CHAI3D = "CHAI3D 3 device specifications, github.com/chai3d/chai3d, src/devices"
@@ -19,6 +22,16 @@ class DeviceProfile:
     max_damping_n_s_per_m: float
     workspace_radius_m: float
     source: str
+
+
+@dataclass(frozen=True)
+class Device:
+    """What a client said of the device that renders for it: its kind, and, when it knows them, its own command-to-force
+    round trip and its own mechanical damping."""
+
+    profile: DeviceProfile
+    round_trip_s: float | None = None
+    damping_n_s_per_m: float | None = None
 
 
 PROFILES = {
@@ -47,6 +60,22 @@ def limits_for(profile: DeviceProfile, ceiling: Limits) -> Limits:
         workspace_radius_m=min(ceiling.workspace_radius_m, profile.workspace_radius_m),
         max_damping_n_s_per_m=profile.max_damping_n_s_per_m,
     )
+
+
+def warnings_for(device: Device, model: ReducedModel, contact: int, scale: float) -> list[str]:
+    """What whoever renders a contact (by index) of `model` with `device` should know; `scale` is their frame's."""
+    rows = slice(3 * contact, 3 * contact + 3)
+    stiffness = float(np.linalg.norm(model.continuous.d[rows, rows], 2)) * scale**2
+    warnings = stiffness_warnings(
+        device.profile, stiffness, model.period_s, device.round_trip_s, device.damping_n_s_per_m
+    )
+    passive_up_to_hz = model.evidence.passive_up_to_hz
+    if passive_up_to_hz < 0.5 / model.period_s * (1 - 1e-9):
+        warnings.append(
+            f"the model dissipates energy up to {passive_up_to_hz:.3g} Hz; faster than that it can give out "
+            f"{model.evidence.largest_energy_out_j * 1e3:.2g} mJ in a poke of 1 mm"
+        )
+    return warnings
 
 
 def stiffness_warnings(

@@ -18,7 +18,7 @@ from palpate_server.compiled import compiled
 
 Image = NDArray[np.int64]
 
-_MAX_WORDS = 1024
+WORDS = 1024  # of 8 bytes: room for a hundred arrays
 
 
 def _borrowed(context, builder, numba_type, value):
@@ -43,7 +43,7 @@ def _pointer_to(context, builder, buffer_type, buffer, numba_type):
 def _store(typing_context, buffer, value):
     def codegen(context, builder, signature, args):
         native = context.get_value_type(signature.args[1])
-        if context.get_abi_sizeof(native) > 8 * _MAX_WORDS:
+        if context.get_abi_sizeof(native) > 8 * WORDS:
             raise ValueError("the tuple is larger than its image may be")
         builder.store(
             _borrowed(context, builder, signature.args[1], args[1]),
@@ -62,7 +62,7 @@ def _write(buffer: Image, value: tuple[Any, ...]) -> None:
 
 def make_image(arrays: tuple[Any, ...]) -> Image:
     """The native image of a (named, nested) tuple of arrays, valid for as long as the caller keeps the arrays."""
-    buffer = np.zeros(_MAX_WORDS, np.int64)
+    buffer = np.zeros(WORDS, np.int64)
     _write(buffer, arrays)
     return buffer
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from palpate_server.devices import Device
 from palpate_server.frames import IDENTITY, Frame
 from palpate_server.safety import Limits
 
@@ -19,13 +20,14 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Terms:
-    """How a contact is held: within which limits and in which frame, from which tick on.
+    """How a contact is held: within which limits, in which frame and with which device, from which tick on.
 
     held_since_tick is the first tick of the present hold, which begins at rest; limits may have changed since.
     """
 
     limits: Limits
     frame: Frame
+    device: Device | None = None
     since_tick: int = 0
     held_since_tick: int = 0
 

@@ -5,6 +5,9 @@ so that the answer leaves at once; otherwise a compiled loop that never needs th
 comes first takes the tick lock; the other finds the deadline moved on. The deadlines slowly shift so that a steady
 client's commands arrive a quarter of a period before them.
 
+Nobody else ever takes that lock: limits, frames, a reset or another model are left in a slot, and the next tick takes
+them out of it before it begins. So no thread of ordinary priority can hold a tick up.
+
 A tick that is missed is made up for at once with the newest input, up to MAX_CATCH_UP of them; what is missed beyond
 that is skipped: model time then stands still, and the skipped ticks are counted.
 """
@@ -32,7 +35,7 @@ from palpate_server.atomics import (
 )
 from palpate_server.clock import monotonic_ns, sleep_until
 from palpate_server.compiled import compiled, compiled_without_gil
-from palpate_server.image import Image, make_view
+from palpate_server.image import WORDS, Image, make_view
 from palpate_server.safety import Flags, Limits
 
 Floats = NDArray[np.float64]
@@ -45,13 +48,33 @@ _BIN_NS = 1_000
 
 _RETRIES = 100  # of a read that a writer disturbs; afterwards the value before is used again
 _RETRY_NS = 20_000  # the deadline loop's nap while the other side runs the tick
-_PHASE_SHIFT_NS = 2_000  # the most that one command moves the deadlines: 0.2 % of a millisecond
+_PHASE_SHIFT_NS = 2_000  # the most that the deadlines move in a tick: 0.2 % of a millisecond
 _PHASE_GAIN = 16
 
-# Columns of Memory.shared: int64 that both sides load and store atomically.
-LOCK, DEADLINE_NS, STOP, HEAD = range(4)
-# Columns of Memory.counters: written under the tick lock alone.
-TICKS, TICKS_ON_ARRIVAL, LATE_TICKS, CAUGHT_UP_TICKS, SKIPPED_TICKS, FAULTS = range(6)
+# The tissue counts as at rest when no tip touches it and no contact's force is above this for so many ticks; its state
+# is then put to zero exactly, which also keeps it from decaying into slow denormal numbers.
+_REST_FORCE_N = 1e-9
+_REST_TICKS = 500
+
+# Columns of Memory.shared: int64 that both sides load and store atomically. CHANGE is one of the kinds of Changes.
+LOCK, DEADLINE_NS, STOP, HEAD, CHANGE = range(5)
+# Columns of Memory.counters: written under the tick lock alone. AT_REST_SINCE is a tick, -1 while something moves.
+(
+    TICKS,
+    TICKS_ON_ARRIVAL,
+    LATE_TICKS,
+    CAUGHT_UP_TICKS,
+    SKIPPED_TICKS,
+    FAULTS,
+    SHIFTED_AT,
+    AT_REST_SINCE,
+    QUIET_TICKS,
+) = range(9)
+# Columns of Memory.tallies: ticks in which a client had the contact, and those with a new command in time.
+COMMANDED_TICKS, FRESH_TICKS = range(2)
+# Kinds of Changes, and the columns of its integers.
+NO_CHANGE, LIMITS, FRAME, RESET, EXCHANGE = range(5)
+CHANGED_CONTACT, CHANGED_AT_TICK = range(2)
 # Columns of Commands.integers; Memory.record_inputs has the age and the flags behind the first two.
 SEQUENCE, CLIENT_TIME_NS, ARRIVAL_NS, RENDERED_TICK = range(4)
 AGE_NS, CONTACT_FLAGS = 2, 3
@@ -88,6 +111,21 @@ class Commands(NamedTuple):
     velocity: Floats
 
 
+class Changes(NamedTuple):
+    """The slot for one change between two ticks; Memory.shared[CHANGE] is its kind while it waits.
+
+    integers (2,): CHANGED_CONTACT, and CHANGED_AT_TICK, the first tick after it; limits (5,); rotation (3, 3), scale
+    (1,), origin (3,), m: a frame; image: of the memory to go on with
+    """
+
+    integers: Integers
+    limits: Floats
+    rotation: Floats
+    scale: Floats
+    origin: Floats
+    image: Image
+
+
 class Model(NamedTuple):
     """A discrete model and its state, as in `kernel`, and the force it gives, (n_contacts, 3), N."""
 
@@ -104,8 +142,10 @@ class Memory(NamedTuple):
     """All that the tick reads and writes, made once. n = n_contacts; int64 and float64.
 
     period_ns        (1,)
-    shared           (4,), LOCK, DEADLINE_NS, STOP, HEAD: the number of complete records
-    counters         (6,)
+    shared           (5,), LOCK, DEADLINE_NS, STOP, HEAD: the number of complete records, CHANGE
+    changes          what is to be changed before the next tick
+    counters         (9,)
+    tallies          (n, 2)
     histograms       (4, HISTOGRAM_BINS) counts, and longest_ns (4,)
     limits           (n, 5), the fields of safety.Limits
     rotation (n, 3, 3), frame_scale (n,), origin (n, 3): the holders' frames, as in frames.Frame
@@ -125,7 +165,9 @@ class Memory(NamedTuple):
 
     period_ns: Integers
     shared: Integers
+    changes: Changes
     counters: Integers
+    tallies: Integers
     histograms: Integers
     longest_ns: Integers
     limits: Floats
@@ -171,12 +213,12 @@ def make_model(system: StateSpace, displacement: Floats | None = None) -> Model:
         blocks[:, 0, 1], blocks[:, 1, 0] = -system.cross[0::2], -system.cross[1::2]
         state[:] = np.linalg.solve(blocks, drive).ravel()
     return Model(
-        diagonal=system.diagonal.copy(),
-        cross=system.cross.copy(),
-        b_transposed=np.ascontiguousarray(system.b.T),
-        c=system.c.copy(),
-        d=system.d.copy(),
-        state=state,
+        diagonal=kernel.aligned(system.diagonal),
+        cross=kernel.aligned(system.cross),
+        b_transposed=kernel.aligned(system.b.T),
+        c=kernel.aligned(system.c),
+        d=kernel.aligned(system.d),
+        state=kernel.aligned(state),
         force=np.zeros((len(system.c) // 3, 3)),
     )
 
@@ -194,12 +236,23 @@ def make_memory(
     period_ns = round(period_s * 1e9)
     no_command = np.zeros((n, 4), np.int64)
     no_command[:, SEQUENCE] = no_command[:, RENDERED_TICK] = -1
-    shared = np.zeros(4, np.int64)
+    shared = np.zeros(5, np.int64)
     shared[DEADLINE_NS] = time.monotonic_ns() + period_ns
+    counters = np.zeros(9, np.int64)
+    counters[SHIFTED_AT] = -1
     return Memory(
         period_ns=np.array([period_ns]),
         shared=shared,
-        counters=np.zeros(6, np.int64),
+        changes=Changes(
+            np.zeros(2, np.int64),
+            np.zeros(len(Limits._fields)),
+            np.zeros((3, 3)),
+            np.zeros(1),
+            np.zeros(3),
+            np.zeros(WORDS, np.int64),
+        ),
+        counters=counters,
+        tallies=np.zeros((n, 2), np.int64),
         histograms=np.zeros((4, HISTOGRAM_BINS), np.int64),
         longest_ns=np.zeros(4, np.int64),
         limits=np.array(limits, np.float64),
@@ -277,69 +330,95 @@ def is_silent(image: Image, contact: int) -> bool:
     return _has_faded(_memory(image), contact)
 
 
-@compiled
-def set_frame(image: Image, contact: int, rotation: Floats, scale: float, origin: Floats) -> int:
-    """Give a silent contact another frame, between two ticks, and put its tip to rest: who comes next starts clean.
+# A change is left in the slot by one thread at a time, which then waits for it with `changed_at`.
 
-    rotation (3, 3), origin (3,), m. Returns the first tick that uses it.
+
+@compiled
+def set_limits(image: Image, contact: int, limits: Floats) -> None:
+    """Ask for other limits of a contact, (5,), the fields of safety.Limits."""
+    m = _memory(image)
+    m.changes.integers[CHANGED_CONTACT] = contact
+    m.changes.limits[:] = limits
+    store_release(m.shared, CHANGE, LIMITS)
+
+
+@compiled
+def set_frame(image: Image, contact: int, rotation: Floats, scale: float, origin: Floats) -> None:
+    """Ask for another frame of a silent contact, and for its tip to be put to rest: who comes next starts clean.
+
+    rotation (3, 3), origin (3,), m
     """
     m = _memory(image)
-    _take_lock(m)
-    m.rotation[contact] = rotation
-    m.frame_scale[contact] = scale
-    m.origin[contact] = origin
-    _put_to_rest(m, contact)
-    tick = m.counters[TICKS]
-    store_release(m.shared, LOCK, 0)
-    return tick
+    m.changes.integers[CHANGED_CONTACT] = contact
+    m.changes.rotation[:] = rotation
+    m.changes.scale[0] = scale
+    m.changes.origin[:] = origin
+    store_release(m.shared, CHANGE, FRAME)
 
 
 @compiled
-def set_limits(image: Image, contact: int, limits: Floats) -> int:
-    """Give a contact other limits, (5,), the fields of safety.Limits, between two ticks; the first that uses them."""
-    m = _memory(image)
-    _take_lock(m)
-    m.limits[contact] = limits
-    tick = m.counters[TICKS]
-    store_release(m.shared, LOCK, 0)
-    return tick
-
-
-@compiled
-def reset(image: Image) -> int:
-    """Put the model and all tips to rest, between two ticks; every force fades in again. Returns the first tick after it.
+def reset(image: Image) -> None:
+    """Ask for the model and all tips to be put to rest; every force fades in again.
 
     A force that a device is rendering is not forgotten: it comes down at the allowed rate.
     """
-    _take_lock(_memory(image))
-    m = _memory(image)
-    m.model.state[:] = 0.0
-    m.next_model.state[:] = 0.0
-    m.scale[:] = 0.0
-    for i in range(m.applied.shape[0]):
-        _put_to_rest(m, i)
-    tick = m.counters[TICKS]
-    store_release(m.shared, LOCK, 0)
-    return tick
+    store_release(_memory(image).shared, CHANGE, RESET)
 
 
 @compiled
-def exchange(image: Image, replacement: Image) -> int:
-    """Let the loop go on with another memory, between two ticks; the first tick that does.
+def exchange(image: Image, replacement: Image) -> None:
+    """Ask the loop to go on with another memory.
 
     `replacement` is the image of the same memory with other `model`, `next_model`, `fade`, or snapshot arrays.
     """
     m = _memory(image)
-    _take_lock(m)
-    image[:] = replacement
-    tick = m.counters[TICKS]
-    store_release(m.shared, LOCK, 0)
-    return tick
+    m.changes.image[:] = replacement
+    store_release(m.shared, CHANGE, EXCHANGE)
+
+
+@compiled
+def changed_at(image: Image) -> int:
+    """The first tick after the change that was asked for, or -1 while no tick has taken it up."""
+    m = _memory(image)
+    if load_acquire(m.shared, CHANGE) != NO_CHANGE:
+        return -1
+    return m.changes.integers[CHANGED_AT_TICK]
+
+
+@compiled
+def _take_up_change(image: Image) -> None:
+    """Carry out what is in the slot. Called with the tick lock held; afterwards the image may be another."""
+    m = _memory(image)
+    kind = load_acquire(m.shared, CHANGE)
+    if kind == NO_CHANGE:
+        return
+    changes = m.changes
+    contact = changes.integers[CHANGED_CONTACT]
+    if kind == LIMITS:
+        m.limits[contact] = changes.limits
+    elif kind == FRAME:
+        m.rotation[contact] = changes.rotation
+        m.frame_scale[contact] = changes.scale[0]
+        m.origin[contact] = changes.origin
+        _put_to_rest(m, contact)
+    elif kind == RESET:
+        m.model.state[:] = 0.0
+        m.next_model.state[:] = 0.0
+        m.scale[:] = 0.0
+        for i in range(m.applied.shape[0]):
+            _put_to_rest(m, i)
+    else:
+        m.counters[AT_REST_SINCE] = -1
+        m.counters[QUIET_TICKS] = 0
+        image[:] = changes.image
+    changes.integers[CHANGED_AT_TICK] = m.counters[TICKS]
+    store_release(m.shared, CHANGE, NO_CHANGE)
 
 
 @compiled
 def repeat_tick(image: Image, start_ns: int) -> None:
     """Run the next tick as if it began at `start_ns`: for replays, where no other thread is at work."""
+    _take_up_change(image)
     _run_tick(_memory(image), start_ns, start_ns, False)
 
 
@@ -360,13 +439,6 @@ def _has_faded(m: Memory, contact: int) -> bool:
 
 
 @compiled
-def _take_lock(m: Memory) -> None:
-    """Wait for the tick to end, some ten microseconds at most. Not for the deadline loop."""
-    while not compare_and_swap(m.shared, LOCK, 0, 1):
-        sleep_until(monotonic_ns() + _RETRY_NS)
-
-
-@compiled
 def tick_on_arrival(image: Image, arrival_ns: int) -> int:
     """A command came at `arrival_ns`: run the tick if its deadline is near, and pull the deadlines towards it.
 
@@ -379,12 +451,16 @@ def tick_on_arrival(image: Image, arrival_ns: int) -> int:
     deadline = m.shared[DEADLINE_NS]
     half = period // 2
     error = (arrival_ns + period // 4 - deadline + half) % period - half
-    shift = min(max(error // _PHASE_GAIN, -_PHASE_SHIFT_NS), _PHASE_SHIFT_NS)
-    deadline += shift
-    store_release(m.shared, DEADLINE_NS, deadline)
+    before = m.counters[TICKS]
+    if (
+        m.counters[SHIFTED_AT] != before
+    ):  # of a burst for one tick, the first counts: no client drags model time along
+        m.counters[SHIFTED_AT] = before
+        deadline += min(max(error // _PHASE_GAIN, -_PHASE_SHIFT_NS), _PHASE_SHIFT_NS)
+        store_release(m.shared, DEADLINE_NS, deadline)
     ticks = 0
     if arrival_ns >= deadline - period // 2:
-        before = m.counters[TICKS]
+        _take_up_change(image)
         _run_due_ticks(_memory(image), arrival_ns)
         ticks = m.counters[TICKS] - before
         m.counters[TICKS_ON_ARRIVAL] += 1
@@ -408,7 +484,8 @@ def run_at_deadlines(image: Image, event_fd: int) -> None:
             continue
         if compare_and_swap(m.shared, LOCK, 0, 1):
             if m.shared[DEADLINE_NS] <= now:
-                _run_due_ticks(_memory(image), now)  # read under the lock: `exchange` may have changed it
+                _take_up_change(image)
+                _run_due_ticks(_memory(image), now)  # the image is another after an exchange
             store_release(m.shared, LOCK, 0)
             _eventfd_write(event_fd, 1)
         else:
@@ -480,9 +557,14 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
         fresh = _read_command(m, i)
         integers = m.newest_integers[i]
         known = integers[SEQUENCE] >= 0
-        age = start - integers[ARRIVAL_NS] if known else -1
+        # A command may come between the start of the tick and here.
+        age = max(0, start - integers[ARRIVAL_NS]) if known else -1
         live = known and age <= safety.HOLD_NS
         flags = tick_flags
+        if known:
+            m.tallies[i, COMMANDED_TICKS] += 1
+            if fresh:
+                m.tallies[i, FRESH_TICKS] += 1
         if live:
             if not fresh:
                 flags |= _HELD
@@ -595,6 +677,8 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
         motion[SCALE] = m.scale[i]
         motion[ENERGY_J] = m.energy[i]
 
+    _settle(m, tick)
+
     m.record_times[row, START_NS] = start
     m.record_times[row, TICK_DEADLINE_NS] = deadline
     m.record_times[row, TICK_FLAGS] = tick_flags
@@ -603,6 +687,29 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
     m.record_times[row, COMPUTE_NS] = compute
     _count(m, COMPUTE_TIME, compute)
     store_release(m.shared, HEAD, tick + 1)
+
+
+@compiled
+def _settle(m: Memory, tick: int) -> None:
+    """Note whether everything is at rest, and put the model's state to zero when what is left of it is negligible."""
+    moving = m.fade[1] > 0.0
+    for i in range(m.applied.shape[0]):
+        moving = moving or not _has_faded(m, i)
+        for j in range(3):
+            moving = moving or m.displacement[i, j] != 0.0
+    if moving:
+        m.counters[AT_REST_SINCE] = -1
+        m.counters[QUIET_TICKS] = 0
+    elif m.counters[AT_REST_SINCE] < 0:
+        for i in range(m.force.shape[0]):
+            for j in range(3):
+                if abs(m.force[i, j]) > _REST_FORCE_N:
+                    m.counters[QUIET_TICKS] = 0
+                    return
+        m.counters[QUIET_TICKS] += 1
+        if m.counters[QUIET_TICKS] >= _REST_TICKS:
+            m.model.state[:] = 0.0
+            m.counters[AT_REST_SINCE] = tick + 1
 
 
 @compiled

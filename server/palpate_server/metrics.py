@@ -28,7 +28,6 @@ _COUNTERS = {
     "skipped_ticks": "missed ticks that were not",
     "faults": "forces that were not finite",
     "accepted": "commands carried out",
-    "unsent_forces": "forces too old to be sent",
 }
 _DURATIONS = ("timer_lateness_s", "tick_lateness_s", "compute_time_s", "input_age_s")
 
@@ -48,8 +47,12 @@ class StatusCollector(Collector):
             return
         for name, text in _COUNTERS.items():
             yield CounterMetricFamily(f"palpate_{name}", text, value=status[name])
-        for kind in ("refused", "malformed"):
-            family = CounterMetricFamily(f"palpate_{kind}", f"commands {kind}, by reason", labels=["reason"])
+        for kind, what in (
+            ("refused", "commands"),
+            ("malformed", "commands"),
+            ("dropped", "commands and forces"),
+        ):
+            family = CounterMetricFamily(f"palpate_{kind}", f"{what} {kind}, by reason", labels=["reason"])
             for reason, count in status[kind].items():
                 family.add_metric([reason], count)
             yield family
@@ -68,6 +71,15 @@ class StatusCollector(Collector):
         for contact, state in status["contacts"].items():
             rate.add_metric([contact], state["success_rate"])
         yield rate
+        since_start = GaugeMetricFamily(
+            "palpate_success_rate_since_start",
+            "share of the ticks with a client that had a new command in time",
+            labels=["contact"],
+        )
+        for contact, state in status["contacts"].items():
+            if state["success_rate_since_start"] is not None:
+                since_start.add_metric([contact], state["success_rate_since_start"])
+        yield since_start
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -28,6 +28,15 @@ def raise_priority(priority: int = LOOP_PRIORITY) -> str | None:
     return None
 
 
+def pin(cpu: int) -> str | None:
+    """Keep the calling thread on one processor, by its number; or say why not."""
+    try:
+        os.sched_setaffinity(0, {cpu})
+    except OSError as error:
+        return f"the loop is not kept on processor {cpu} ({error.strerror})"
+    return None
+
+
 def lock_memory() -> str | None:
     """Keep the process's memory from being swapped out; or say why not."""
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)

@@ -69,10 +69,10 @@ def through_a_model(
 ) -> tuple[RoundTrips, dict[str, Any]]:
     """Against a server of its own for the model in `path`, driven at one contact; and that server's last status.
 
-    With `viewer` the surface is listened to as well, by the same process: more work for the server and for the client.
+    With `viewer` the surface is listened to as well, 60 times a second and by the same process: more work for both.
     """
     endpoint = free_endpoint()
-    command = [sys.executable, "-m", "palpate_server", str(path), "--listen", endpoint]
+    command = [sys.executable, "-m", "palpate_server", str(path), "--listen", endpoint, "--surface-hz", "60"]
     keys = wire.Keys("main")
     statuses: list[dict[str, Any]] = []
     with running(command, "serving"), transport.connect_session(endpoint, None) as session:

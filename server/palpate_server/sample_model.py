@@ -13,7 +13,7 @@ from palpate.model import Contact, Evidence, PoleResidueSystem, ReducedModel, St
 
 
 def spring_mass_model(n_contacts: int = 1, n_modes: int = 4, period_s: float = 1e-3) -> ReducedModel:
-    """Passive, quick to make, and with a known response.
+    """Passive (sampled as well), quick to make, and with a known response.
 
     F(s) = K u - sum_k p_k p_k^T / (s² + 2 zeta w_k s + w_k²) u with K > sum_k p_k p_k^T / w_k², discretised with
     first-order hold.
@@ -74,6 +74,7 @@ def spring_mass_model(n_contacts: int = 1, n_modes: int = 4, period_s: float = 1
             "error_bound": None,
             "spectral_abscissa": abscissa,
             "spectral_abscissa_full": abscissa,
+            "passive_up_to_hz": 0.5 / period_s,
             "resolved_frequency_hz": 100.0,
             "band_hz": (0.0, 30.0),
             "hankel_singular_values": np.zeros(0),

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import zenoh
 from palpate.model import ModelFileError, ReducedModel, StateSpace, load_model
 from palpate_server import loop, realtime, safety, telemetry, wire
 from palpate_server.black_box import BlackBox
-from palpate_server.devices import PROFILES, limits_for, stiffness_warnings
+from palpate_server.devices import PROFILES, Device, limits_for, warnings_for
 from palpate_server.frames import Frame, read_frame
 from palpate_server.image import make_image
 from palpate_server.leases import Leases, Refused, Terms
@@ -29,10 +30,13 @@ from palpate_server.safety import Flags, Limits
 log = logging.getLogger("palpate_server")
 
 STATUS_PERIOD_S = 0.1
-SURFACE_PERIOD_S = 1 / 30
+USUAL_SURFACE_HZ, FASTEST_SURFACE_HZ = 30.0, 60.0
 FADE_OVER_S = 0.5  # from one model to another
 MAX_UNSENT = 100  # ticks whose forces are still worth sending; what is older is dropped and counted
+MAX_WAITING = 64  # queries; more are refused at once
+_LEASES_FIRST, _QUERIES, _END = range(3)  # the order in which events are served
 _ALIVE_TIMEOUT_S = 1.0
+_CHANGE_TIMEOUT_S = 1.0
 _LONGEST_FILE_NAME = 255  # bytes, on the usual file systems
 
 
@@ -42,6 +46,8 @@ class Server:
     Threads: Zenoh's own one that receives commands (and runs most ticks), the deadline loop (compiled, never needs
     the GIL), one that sends the forces of its ticks, one for queries and leases, one for the surface. The thread that
     calls `publish_status` sends the status.
+
+    cpu: to keep the threads that run ticks on, or None to leave that to the system.
     """
 
     def __init__(
@@ -52,6 +58,8 @@ class Server:
         keys: wire.Keys,
         models: Path,
         black_box: Path | None = None,
+        surface_hz: float = USUAL_SURFACE_HZ,
+        cpu: int | None = None,
     ) -> None:
         self.model = model
         self.limits = limits
@@ -59,12 +67,15 @@ class Server:
         self.keys = keys
         self.names = [contact.name for contact in model.contacts]
         self.leases = Leases(self.names, limits)
-        self.messages = telemetry.MessageCounters()
+        self.messages = telemetry.MessageCounters(len(self.names))
+        self.surface_period_s = 1 / surface_hz
         self.memory = loop.make_memory(
-            model.discrete, model.period_s, [limits] * len(self.names), SURFACE_PERIOD_S
+            model.discrete, model.period_s, [limits] * len(self.names), self.surface_period_s
         )
         self.image = make_image(self.memory)
         self._models = models
+        self._cpu = cpu
+        self._changing = threading.Lock()  # the loop has one slot for changes
         self._model_in_use = (
             threading.Lock()
         )  # while the surface is computed from it, and while it is exchanged
@@ -79,7 +90,8 @@ class Server:
         self._undisturbed_since_tick = (
             0  # by a reset or another model: until then a recording can be repeated
         )
-        self._events: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._events: queue.PriorityQueue[tuple[int, int, Callable[[], None]]] = queue.PriorityQueue()
+        self._event_numbers = itertools.count()
         self._stopping = threading.Event()
         self._wake = os.eventfd(0)
         self._sending = threading.Lock()
@@ -106,10 +118,13 @@ class Server:
             keys.surface, encoding=wire.ENCODING, priority=zenoh.Priority.DATA_LOW, congestion_control=drop
         )
         self._declared: list[Any] = [
-            session.declare_queryable(keys.describe, self._later(self._answer_describe)),
-            session.declare_queryable(keys.geometry, self._later(self._answer_geometry)),
-            session.declare_queryable(keys.control("*", "*"), self._later(self._answer_control)),
-            session.liveliness().declare_subscriber(keys.client("*"), self._later(self._on_liveliness)),
+            session.declare_queryable(keys.describe, self._queue_query(self._answer_describe)),
+            session.declare_queryable(keys.geometry, self._queue_query(self._answer_geometry)),
+            session.declare_queryable(keys.control("*", "*"), self._queue_query(self._answer_control)),
+            session.liveliness().declare_subscriber(
+                keys.client("*"),
+                lambda sample: self._queue(_LEASES_FIRST, lambda: self._on_liveliness(sample)),
+            ),
             session.declare_subscriber(keys.command("*"), self._on_command),
         ]
         self._threads = [
@@ -139,7 +154,7 @@ class Server:
         self.publish_status()
         loop.stop(self.memory.shared)
         self._stopping.set()
-        self._events.put(None)
+        self._queue(_END, lambda: None)
         self._threads[0].join()
         os.eventfd_write(self._wake, 1)
         for thread in self._threads[1:]:
@@ -155,7 +170,7 @@ class Server:
         arrival_ns = time.monotonic_ns()
         if not self._command_thread_raised:
             self._command_thread_raised = True
-            realtime.raise_priority(
+            self._prepare_thread(
                 realtime.COMMAND_PRIORITY
             )  # whether it may has been said by the loop's thread
         messages = self.messages
@@ -174,6 +189,7 @@ class Server:
         for name, displacement in command.displacement_m.items():
             contact = self._contact_index[name]
             self._last_sequence[contact] = command.sequence
+            messages.accepted_of[contact] += 1
             loop.write_command(
                 self.memory.commands,
                 contact,
@@ -205,9 +221,13 @@ class Server:
 
     def _send_forces(self) -> None:
         """Publish the ticks that are not sent yet, in order, unless another thread is at it (which then is told)."""
-        if not self._sending.acquire(blocking=False):
+        if self._sending.acquire(blocking=False):
+            self._send_forces_alone()
+        else:
             os.eventfd_write(self._wake, 1)
-            return
+
+    def _send_forces_alone(self) -> None:
+        """With `_sending` held, which is given back."""
         try:
             memory = self.memory
             head = int(loop.records_written(memory.shared))
@@ -226,18 +246,31 @@ class Server:
             self._sending.release()
 
     def _run_deadlines(self) -> None:
-        if notice := realtime.raise_priority():
+        for notice in self._prepare_thread(realtime.LOOP_PRIORITY):
             log.warning(notice)
         loop.run_at_deadlines(self.image, self._wake)
+
+    def _prepare_thread(self, priority: int) -> list[str]:
+        """For ticks: real-time priority, and the processor that was asked for; what is not allowed."""
+        pinned = None if self._cpu is None else realtime.pin(self._cpu)
+        return [notice for notice in (realtime.raise_priority(priority), pinned) if notice]
 
     def _send_at_deadlines(self) -> None:
         while not self._stopping.is_set():
             os.eventfd_read(self._wake)
-            self._send_forces()
+            self._sending.acquire()
+            self._send_forces_alone()
 
     # Status and surface
 
     def publish_status(self) -> None:
+        """Send the status, and see whether the black box has cause to write. No mistake in it ends the service."""
+        try:
+            self._publish_status()
+        except Exception:
+            log.exception("the status could not be sent")
+
+    def _publish_status(self) -> None:
         status = telemetry.status(
             self._state,
             time.monotonic_ns(),
@@ -253,7 +286,9 @@ class Server:
     def _publish_surfaces(self) -> None:
         tips = np.zeros((len(self.names), 3))
         last_tick = -1
-        while not self._stopping.wait(SURFACE_PERIOD_S):
+        due_s = time.monotonic()
+        while not self._stopping.wait(max(0.0, due_s - time.monotonic())):
+            due_s = max(due_s + self.surface_period_s, time.monotonic())
             if not self._surface.matching_status:
                 continue
             with self._model_in_use:
@@ -269,12 +304,24 @@ class Server:
 
     # Queries and leases, one after another on a thread of their own
 
-    def _later(self, handle: Callable[[Any], None]) -> Callable[[Any], None]:
-        """A Zenoh callback that only leaves the work for the query thread, so that it can't stall the session."""
-        return lambda event: self._events.put(lambda: handle(event))
+    def _queue(self, urgency: int, event: Callable[[], None]) -> None:
+        """Leave work for the query thread: a Zenoh callback that did it would stall the session."""
+        self._events.put((urgency, next(self._event_numbers), event))
+
+    def _queue_query(self, answer: Callable[[zenoh.Query], None]) -> Callable[[zenoh.Query], None]:
+        def take(query: zenoh.Query) -> None:
+            if self._events.qsize() < MAX_WAITING:
+                self._queue(_QUERIES, lambda: answer(query))
+            else:
+                with query:
+                    _refuse(query, "busy", f"{MAX_WAITING} queries are waiting")
+
+        return take
 
     def _serve_events(self) -> None:
-        while (event := self._events.get()) is not None:
+        urgency = _QUERIES
+        while urgency != _END:
+            urgency, _, event = self._events.get()
             try:
                 event()
             except Exception:  # one client's query must not end the service of the others
@@ -282,7 +329,7 @@ class Server:
 
     def _answer_describe(self, query: zenoh.Query) -> None:
         with query:
-            description = describe(self.model, self.limits, self.keys.session)
+            description = describe(self.model, self.limits, self.keys.session, self.surface_period_s)
             query.reply(self.keys.describe, wire.pack(description), encoding=wire.ENCODING)
 
     def _answer_geometry(self, query: zenoh.Query) -> None:
@@ -302,16 +349,11 @@ class Server:
             try:
                 client, action = wire.client_and_action(str(query.key_expr))
                 reply = self._carry_out(client, action, _request(query))
-            except wire.MalformedMessage as error:
-                refusal = {"reason": error.reason, "message": str(error)}
-                query.reply_err(wire.pack(refusal), encoding=wire.ENCODING)
-            except Refused as error:
-                refusal = {"reason": error.reason, "message": str(error)}
-                query.reply_err(wire.pack(refusal), encoding=wire.ENCODING)
+            except (wire.MalformedMessage, Refused) as error:
+                _refuse(query, error.reason, str(error))
             except Exception:  # a mistake of ours: whoever waits for the answer shall not wait in vain
                 log.exception("a query could not be answered")
-                refusal = {"reason": "internal", "message": "the server failed at it; its log says why"}
-                query.reply_err(wire.pack(refusal), encoding=wire.ENCODING)
+                _refuse(query, "internal", "the server failed at it; its log says why")
             else:
                 query.reply(query.key_expr, wire.pack(reply), encoding=wire.ENCODING)
 
@@ -341,34 +383,23 @@ class Server:
             frame = read_frame(request.get("frame"))
         except ValueError as error:
             raise wire.MalformedMessage("wrong_type", str(error)) from error
-        device = request.get("device")
-        if device is not None and not (isinstance(device, str) and device in PROFILES):
-            raise Refused("unknown_device", f"device is {device!r}: there are {', '.join(PROFILES)}")
-        round_trip_s = _optional_number(request, "round_trip_s")
-        damping = _optional_number(request, "device_damping_n_s_per_m")
+        device = _device(request)
         if self._state != "running":
             raise Refused("stopping", "the server is stopping")
         self._check_alive(client)
         self.leases.check(client, contacts)
 
-        limits, warnings = self.limits, []
-        for name in contacts:
-            if device is not None:
-                limits = limits_for(PROFILES[device], self.limits)
-                stiffness = self._instant_stiffness(self._contact_index[name]) * frame.scale**2
-                warnings += stiffness_warnings(
-                    PROFILES[device], stiffness, self.model.period_s, round_trip_s, damping
-                )
+        limits = self.limits if device is None else limits_for(device.profile, self.limits)
         self._silence(contacts)
         for name in contacts:
             self._last_sequence[self._contact_index[name]] = -1
-            self._set_terms(name, limits, frame)
-            self.leases.holders[name] = client
+            self._set_terms(name, limits, frame, device)
+        self.leases.holders |= dict.fromkeys(contacts, client)
         return {
             "contacts": contacts,
             "limits": limits._asdict(),
             "frame": asdict(frame),
-            "warnings": warnings,
+            "warnings": self._warnings(contacts),
         }
 
     def _check_alive(self, client: str) -> None:
@@ -395,18 +426,39 @@ class Server:
                 raise Refused("busy", "the force did not fade in time: the server is overloaded")
             time.sleep(self.model.period_s)
 
-    def _set_terms(self, name: str, limits: Limits, frame: Frame) -> None:
+    def _set_terms(self, name: str, limits: Limits, frame: Frame, device: Device | None) -> None:
         contact = self._contact_index[name]
-        loop.set_limits(self.image, contact, np.array(limits))
-        tick = loop.set_frame(
-            self.image, contact, np.array(frame.rotation), frame.scale, np.array(frame.origin_m)
-        )
-        self.leases.terms[name] = Terms(limits, frame, tick, tick)
+        self._between_ticks(loop.set_limits, contact, np.array(limits))
+        rotation, origin = np.array(frame.rotation), np.array(frame.origin_m)
+        tick = self._between_ticks(loop.set_frame, contact, rotation, frame.scale, origin)
+        self.leases.terms[name] = Terms(limits, frame, device, tick, tick)
 
-    def _instant_stiffness(self, contact: int) -> float:
-        """N/m, the largest over the directions."""
-        rows = slice(3 * contact, 3 * contact + 3)
-        return float(np.linalg.norm(self.model.continuous.d[rows, rows], 2))
+    def _between_ticks(self, ask: Callable[..., None], *what: Any) -> int:
+        """Have the loop change something; the first tick after it. Raises Refused when no tick comes."""
+        with self._changing:
+            self._wait_for_change()
+            ask(self.image, *what)
+            return self._wait_for_change()
+
+    def _wait_for_change(self) -> int:
+        give_up = time.monotonic() + _CHANGE_TIMEOUT_S
+        while (tick := loop.changed_at(self.image)) < 0:
+            if time.monotonic() > give_up:
+                raise Refused(
+                    "busy", "no tick came that could have made the change: the server is overloaded"
+                )
+            time.sleep(self.model.period_s / 4)
+        return tick
+
+    def _warnings(self, contacts: Iterable[str]) -> list[str]:
+        """What whoever renders these contacts with the device it named should know of the model that runs."""
+        warnings: list[str] = []
+        for name in contacts:
+            terms = self.leases.terms[name]
+            if terms.device is not None:
+                index = self._contact_index[name]
+                warnings += warnings_for(terms.device, self.model, index, terms.frame.scale)
+        return list(dict.fromkeys(warnings))  # contacts are often alike
 
     def _set_limits(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
         held = self.leases.held_by(client)
@@ -435,13 +487,13 @@ class Server:
         for name in held:
             terms = self.leases.terms[name]
             limits = terms.limits._replace(**wanted)
-            tick = loop.set_limits(self.image, self._contact_index[name], np.array(limits))
-            self.leases.terms[name] = Terms(limits, terms.frame, tick, terms.held_since_tick)
+            tick = self._between_ticks(loop.set_limits, self._contact_index[name], np.array(limits))
+            self.leases.terms[name] = replace(terms, limits=limits, since_tick=tick)
         return {"contacts": list(held), "limits": limits._asdict()}
 
     def _reset(self, client: str) -> dict[str, Any]:
         self._check_alone(client)
-        self._undisturbed_since_tick = loop.reset(self.image)
+        self._undisturbed_since_tick = self._between_ticks(loop.reset)
         return {}
 
     def _check_alone(self, client: str) -> None:
@@ -462,7 +514,7 @@ class Server:
             following = loop.make_model(model.discrete, displacement)
             step = model.period_s / FADE_OVER_S
             fading = self.memory._replace(next_model=following, fade=np.array([0.0, step]))
-            self._undisturbed_since_tick = loop.exchange(self.image, make_image(fading))
+            self._undisturbed_since_tick = self._between_ticks(loop.exchange, make_image(fading))
             while fading.fade[0] < 1.0:
                 if self._stopping.wait(model.period_s):
                     raise Refused("stopping", "the server is stopping")
@@ -473,10 +525,11 @@ class Server:
                     snapshot_tick=np.full(1, -1),
                     snapshot_state=np.zeros(model.order),
                 )
-                loop.exchange(self.image, make_image(self.memory))
+                self._between_ticks(loop.exchange, make_image(self.memory))
                 self.model = model
             log.info("now serving %s (order %d)", model.name, model.order)
-            return {"model": model.name, "order": model.order}
+            warnings = self._warnings(self.leases.held_by(client))
+            return {"model": model.name, "order": model.order, "warnings": warnings}
         finally:
             self._loading.release()
 
@@ -522,7 +575,7 @@ class Server:
                 log.info("client %s is gone: contact %s is free", client, name)
 
 
-def describe(model: ReducedModel, limits: Limits, session: str) -> dict[str, Any]:
+def describe(model: ReducedModel, limits: Limits, session: str, surface_period_s: float) -> dict[str, Any]:
     """The describe reply: what a client must know before it moves anything."""
     summary = model.summary()
     summary["evidence"].pop("hankel_singular_values")
@@ -537,7 +590,7 @@ def describe(model: ReducedModel, limits: Limits, session: str) -> dict[str, Any
         "decay_s": safety.DECAY_NS * 1e-9,
         "soft_start_s": safety.SOFT_START_NS * 1e-9,
         "status_period_s": STATUS_PERIOD_S,
-        "surface_period_s": SURFACE_PERIOD_S,
+        "surface_period_s": surface_period_s,
         "flags": {flag.name: flag.value for flag in Flags},
         "model": summary,
     }
@@ -566,7 +619,7 @@ def warm_up(period_s: float, n_contacts: int) -> None:
         np.zeros((channels, channels)),
     )
     limits = [Limits(1.0, 1.0, 1.0, 1.0, 1.0)] * n_contacts
-    memory = loop.make_memory(system, period_s, limits, SURFACE_PERIOD_S)
+    memory = loop.make_memory(system, period_s, limits, 1 / USUAL_SURFACE_HZ)
     loop.write_command(memory.commands, 0, 1, 1, 1, -1, wire.STILL, wire.STILL)
     loop.forget_command(memory.commands, 0)
     image = make_image(memory)
@@ -578,11 +631,29 @@ def warm_up(period_s: float, n_contacts: int) -> None:
     loop.set_limits(image, 0, np.ones(5))
     loop.reset(image)
     loop.exchange(image, make_image(memory))
+    loop.changed_at(image)
     loop.read_snapshot(image, np.zeros(2), np.zeros((n_contacts, 3)))
     loop.stop(memory.shared)
     wake = os.eventfd(0)
     loop.run_at_deadlines(image, wake)
     os.close(wake)
+
+
+def _refuse(query: zenoh.Query, reason: str, message: str) -> None:
+    query.reply_err(wire.pack({"reason": reason, "message": message}), encoding=wire.ENCODING)
+
+
+def _device(request: dict[str, Any]) -> Device | None:
+    name = request.get("device")
+    if name is None:
+        return None
+    if not (isinstance(name, str) and name in PROFILES):
+        raise Refused("unknown_device", f"device is {name!r}: there are {', '.join(PROFILES)}")
+    return Device(
+        PROFILES[name],
+        _optional_number(request, "round_trip_s"),
+        _optional_number(request, "device_damping_n_s_per_m"),
+    )
 
 
 def _optional_number(request: dict[str, Any], field: str) -> float | None:
@@ -612,11 +683,15 @@ def serve(
     on_ready: Callable[[], None],
     models: Path,
     black_box: Path | None = None,
+    surface_hz: float = USUAL_SURFACE_HZ,
+    cpu: int | None = None,
 ) -> None:
     """Serve until `stop` is set. Clients may load from the folder `models`; black box files go to `black_box`, or nowhere."""
-    server = Server(model, limits, session, keys, models, black_box)
+    server = Server(model, limits, session, keys, models, black_box, surface_hz, cpu)
     server.start()
-    on_ready()
-    while not stop.wait(STATUS_PERIOD_S):
-        server.publish_status()
-    server.stop()
+    try:
+        on_ready()
+        while not stop.wait(STATUS_PERIOD_S):
+            server.publish_status()
+    finally:
+        server.stop()

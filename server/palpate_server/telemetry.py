@@ -12,17 +12,21 @@ from numpy.typing import NDArray
 from palpate_server import loop
 from palpate_server.leases import Leases
 from palpate_server.safety import Flags
-from palpate_server.wire import MALFORMED, REFUSED
+from palpate_server.wire import DROPPED, MALFORMED, REFUSED
 
 ROLLING_TICKS = 100
 _BIN_S = 1e-6
 
 
 class MessageCounters:
-    """How many commands were accepted, refused and malformed, by reason; each written by the receiving thread."""
+    """How many commands were accepted, refused and malformed, by reason; each written by the receiving thread.
 
-    def __init__(self) -> None:
+    accepted_of counts by contact: a command can move several.
+    """
+
+    def __init__(self, n_contacts: int) -> None:
         self.accepted = 0
+        self.accepted_of = [0] * n_contacts
         self.refused: Counter[str] = Counter(dict.fromkeys(REFUSED, 0))
         self.malformed: Counter[str] = Counter(dict.fromkeys(MALFORMED, 0))
         self.unsent_forces = 0
@@ -57,6 +61,22 @@ def recent_success_rate(memory: loop.Memory, contact: int) -> float:
     return float(np.mean(flags & int(late) == 0))
 
 
+def dropped(memory: loop.Memory, messages: MessageCounters) -> dict[str, int]:
+    """What was accepted or made and then not used, by reason, as in wire.DROPPED.
+
+    A command that waits for the tick at this moment is not yet used and counts as superseded until it is.
+    """
+    used = memory.tallies[:, loop.FRESH_TICKS].tolist()
+    superseded = sum(messages.accepted_of) - sum(used)
+    return dict(zip(DROPPED, (max(0, superseded), messages.unsent_forces), strict=True))
+
+
+def success_rate(memory: loop.Memory, contact: int) -> float | None:
+    """Share of the ticks since the start in which a new command had come in time, of those with a client; None without."""
+    commanded, fresh = memory.tallies[contact].tolist()
+    return fresh / commanded if commanded else None
+
+
 def status(
     state: str,
     server_time_ns: int,
@@ -77,6 +97,7 @@ def status(
         "state": state,
         "server_time_ns": server_time_ns,
         "undisturbed_since_tick": undisturbed_since_tick,
+        "at_rest_since_tick": ticks[loop.AT_REST_SINCE],
         "ticks": ticks[loop.TICKS],
         "ticks_on_arrival": ticks[loop.TICKS_ON_ARRIVAL],
         "late_ticks": ticks[loop.LATE_TICKS],
@@ -90,11 +111,12 @@ def status(
         "accepted": messages.accepted,
         "refused": dict(messages.refused),
         "malformed": dict(messages.malformed),
-        "unsent_forces": messages.unsent_forces,
+        "dropped": dropped(memory, messages),
         "contacts": {
             name: {
                 "holder": holder,
                 "success_rate": recent_success_rate(memory, index),
+                "success_rate_since_start": success_rate(memory, index),
                 "limits": leases.terms[name].limits._asdict(),
                 "frame": asdict(leases.terms[name].frame),
                 "since_tick": leases.terms[name].since_tick,

@@ -40,8 +40,10 @@ class MalformedMessage(ValueError):
         self.reason = reason
 
 
-# Why a payload can't be read, and why a readable command is not carried out: the counters in the status message.
+# Why a payload can't be read, why an accepted command or a force went no further, and why a readable command is not
+# carried out: the counters in the status message.
 MALFORMED = ("too_large", "not_msgpack", "not_a_map", "missing_field", "wrong_type", "wrong_shape")
+DROPPED = ("superseded", "unsent_force")
 REFUSED = ("not_finite", "out_of_range", "unknown_contact", "not_holder", "old_sequence", "stopping")
 
 

@@ -68,6 +68,11 @@ def test_bursts_of_commands_make_no_more_ticks_than_time_has(
         assert ticks <= elapsed_ns * 1.002e-6 + 2  # the deadlines follow a client by 0.2 % at most
         assert ticks >= elapsed_ns * 0.998e-6 - 25  # what is missed now is made up for later
         assert after["accepted"] - before["accepted"] == 2000
+        # Every command was used by one tick, or replaced before; of those that were used, the answer may be lost.
+        superseded = after["dropped"]["superseded"] - before["dropped"]["superseded"]
+        answered = {message["sequence"][0] for message in client.forces} - {-1}
+        assert superseded > 1000
+        assert len(answered) <= 2000 - superseded
         check(client.forces)
         assert limits_were_met(client.forces)
 

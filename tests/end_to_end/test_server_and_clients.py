@@ -123,7 +123,7 @@ def test_force_is_zero_within_a_tenth_of_a_second_after_the_client_is_killed(
         assert granted
 
 
-def test_a_paused_client_is_faded_out_and_softly_in_again(
+def test_a_client_that_pauses_for_half_a_second_is_faded_out_and_softly_in_again(
     serve: Callable[..., Any], run_example: Callable[..., Any], connect: Callable[..., Any]
 ) -> None:
     served = serve()
@@ -133,15 +133,27 @@ def test_a_paused_client_is_faded_out_and_softly_in_again(
         )
         wait_until(lambda: observer.forces[-1]["force_scale"][0] == 1)
         client.send_signal(signal.SIGSTOP)
-        wait_until(lambda: observer.forces[-1]["flags"][0] & Flags.STALE)
-        first = len(observer.forces)
+        paused = len(observer.forces)
+        time.sleep(0.5)
+        resumed = len(observer.forces)
         client.send_signal(signal.SIGCONT)
+        during = [Flags(m["flags"][0]) for m in observer.forces[paused:resumed]]
+        assert any(flags & Flags.HELD for flags in during)
+        assert any(flags & Flags.DECAYING for flags in during)
+        stale = [m for m in observer.forces[paused:resumed] if m["flags"][0] & Flags.STALE]
+        assert len(stale) > 200  # of 500 ticks 70 are hold and fading; a busy machine may lose some
+        assert not any(np.any(m["force_n"][0]) for m in stale)
         wait_until(lambda: observer.forces[-1]["force_scale"][0] == 1)
-        messages = observer.forces[first - 1 :]
-        changes = np.diff([m["force_n"][0] for m in messages], axis=0)
-        assert np.linalg.norm(changes, axis=1).max() <= 2.0 + 1e-9  # the default 2000 N/s
-        scale_changes = np.diff([m["force_scale"][0] for m in messages])
-        assert scale_changes.max() <= 1e-3 / 0.2 + 1e-9
+        messages = observer.forces[paused - 1 :]
+        assert any(m["flags"][0] & Flags.SOFT_START for m in messages)
+        for before, after in itertools.pairwise(messages):
+            ticks = after["tick"] - before["tick"]
+            step = math.dist(before["force_n"][0], after["force_n"][0])
+            assert step <= 2.0 * ticks + 1e-9  # the default 2000 N/s
+            assert after["force_scale"][0] - before["force_scale"][0] <= ticks * 1e-3 / 0.2 + 1e-9
+        state = observer.next_status()["contacts"]["tip"]
+        assert state["holder"] is not None  # half a second is no reason to lose the lease
+        assert 0 < state["success_rate_since_start"] < 1
 
 
 def test_a_killed_server_is_named_by_the_client_which_fails(
@@ -197,17 +209,17 @@ def test_ten_thousand_malformed_messages_leave_the_server_ticking(
         assert granted
         payloads = malformed_payloads(10_000)
         before = client.next_status()
+        client.put(bytes(10_000_000))  # the server's session drops it: not even counted, and the link stays
         for payload in payloads:
             client.put(payload)
-        client.put(bytes(10_000_000))
 
         def counted(status: dict[str, Any]) -> int:
             return sum(status["refused"].values()) + sum(status["malformed"].values())
 
-        wait_until(lambda: counted(client.statuses[-1]) - counted(before) == len(payloads) + 1, 60)
+        wait_until(lambda: counted(client.statuses[-1]) - counted(before) == len(payloads), 60)
         after = client.next_status()
         assert after["accepted"] == before["accepted"]
-        assert after["malformed"]["too_large"] == 1001
+        assert after["malformed"]["too_large"] == 1000
         assert after["refused"]["not_finite"] == 2000
         assert after["faults"] == 0
         assert after["ticks"] > before["ticks"]
@@ -267,7 +279,7 @@ def test_every_refusal_carries_its_reason(
 
 
 def test_a_device_brings_its_limits_its_frame_and_warnings(
-    serve: Callable[..., Any], connect: Callable[..., Any]
+    serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
 ) -> None:
     served = serve()
     with connect(served.endpoint) as client:
@@ -282,6 +294,15 @@ def test_a_device_brings_its_limits_its_frame_and_warnings(
         assert status["holder"] == client.name
         assert status["limits"] == terms["limits"]
         assert status["frame"]["scale"] == 2.0
+
+        save_model(spring_mass_model(1, 35), tmp_path / "stiffer.npz")
+        granted, answer = client.control("load", {"model": "stiffer.npz"})
+        assert granted
+        damping, stiffer = (next(w for w in of["warnings"] if "damping" in w) for of in (terms, answer))
+        needed, needed_by_stiffer = (
+            float(re.search(r"above the ([\d.e+]+)", w)[1]) for w in (damping, stiffer)
+        )
+        assert needed_by_stiffer > needed
 
         granted, refusal = client.control("acquire", request | {"device": "hammer"})
         assert (granted, refusal["reason"]) == (False, "unknown_device")
@@ -388,7 +409,8 @@ def test_a_model_is_exchanged_while_a_client_presses_and_a_bad_file_leaves_the_o
                 assert (granted, refusal["reason"]) == (False, "bad_model")
             assert client.query("describe")[1]["model"]["name"] == "masses on springs"
             first = len(client.forces)
-            assert client.control("load", {"model": "other.npz"}) == (True, {"model": "other", "order": 70})
+            answer = {"model": "other", "order": 70, "warnings": []}
+            assert client.control("load", {"model": "other.npz"}) == (True, answer)
             last = len(client.forces)
             after = client.next_status()
         finally:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
-from palpate_server.devices import PROFILES, limits_for, stiffness_warnings
+from palpate.model import ReducedModel
+from palpate_server.devices import PROFILES, Device, limits_for, stiffness_warnings, warnings_for
 from palpate_server.safety import Limits
 
 GENERIC = PROFILES["generic"]
@@ -47,3 +52,27 @@ def test_a_stiffness_beyond_the_device_or_colgates_condition_is_warned_about(
     stiffness: float, round_trip: float | None, damping: float | None, count: int
 ) -> None:
     assert len(stiffness_warnings(GENERIC, stiffness, 1e-3, round_trip, damping)) == count
+
+
+def test_a_model_that_can_give_out_energy_is_warned_about(
+    make_spring_mass_model: Callable[..., ReducedModel],
+) -> None:
+    model = make_spring_mass_model()
+    device = Device(replace(GENERIC, max_stiffness_n_per_m=1e9))
+    assert warnings_for(device, model, 0, 1.0) == []
+    evidence = replace(model.evidence, passive_up_to_hz=425.0, largest_energy_out_j=1.6e-4)
+    (warning,) = warnings_for(device, replace(model, evidence=evidence), 0, 1.0)
+    assert "425 Hz" in warning
+    assert "0.16 mJ" in warning
+
+
+def test_the_sample_model_is_passive_at_every_frequency(
+    make_spring_mass_model: Callable[..., ReducedModel],
+) -> None:
+    """As its evidence says. By the dense response: no sinusoid gets energy out."""
+    model = make_spring_mass_model(2, 20)
+    system, a = model.discrete, model.discrete.dense_a()
+    for theta in np.linspace(0, np.pi, 300):
+        g = system.c @ np.linalg.solve(np.exp(1j * theta) * np.eye(len(a)) - a, system.b) + system.d
+        least = np.linalg.eigvalsh((g - g.conj().T) / 2j)[0]
+        assert least >= -1e-12 * np.linalg.norm(g, 2)

@@ -254,11 +254,11 @@ def test_a_reset_puts_the_tip_to_rest_and_takes_the_force_down_at_the_allowed_ra
         _, _, before, _ = tick(spring)
     assert np.linalg.norm(before) == pytest.approx(USUAL.max_force_n)
     loop.reset(make_image(spring))
-    np.testing.assert_array_equal(spring.applied, 0)
-    np.testing.assert_array_equal(spring.displacement, 0)
     for i in range(300, 320):
         command(spring, i, (0.0, 0.0, 0.0))
-        _, _, force, _ = tick(spring)
+        flags, applied, force, _ = tick(spring)
+        assert not flags & Flags.SPEED_LIMITED  # it is there, it need not go there
+        np.testing.assert_array_equal(applied, 0)
         assert np.linalg.norm(force - before) <= USUAL.max_force_rate_n_per_s * 1e-3 * (1 + 1e-12)
         before = force
     np.testing.assert_array_equal(force, 0)
@@ -354,14 +354,19 @@ def test_energy_counts_the_force_that_the_device_was_rendering(memory: loop.Memo
     np.testing.assert_allclose(memory.record_motion[row, 0, loop.ENERGY_J], expected, rtol=1e-9)
 
 
-def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(memory: loop.Memory) -> None:
+def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(
+    memory: loop.Memory, make_spring_mass_model: Callable[..., ReducedModel]
+) -> None:
     for i in range(250):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
+    assert np.any(memory.model.state)
     loop.reset(make_image(memory))
-    np.testing.assert_array_equal(memory.model.state, 0)
+    assert loop.changed_at(make_image(memory)) == -1
     command(memory, 250, (0.0, 0.0, 1e-3))
-    flags, *_, scale = tick(memory)
+    flags, applied, _, scale = tick(memory)
+    assert loop.changed_at(make_image(memory)) == 250
+    np.testing.assert_allclose(memory.force[0], make_spring_mass_model().discrete.d @ applied, rtol=1e-12)
     assert flags & Flags.SOFT_START
     assert scale < 0.01
 
@@ -425,6 +430,52 @@ def test_deadlines_settle_a_quarter_of_a_period_behind_steady_arrivals(memory: l
         phase = (memory.shared[loop.DEADLINE_NS] - start) % PERIOD_NS
         assert abs(phase - PERIOD_NS // 4) < PERIOD_NS // 50
         assert abs(ticks - 600) <= 1
+
+
+def test_a_burst_moves_the_deadlines_no_more_than_one_command_does(memory: loop.Memory) -> None:
+    image = make_image(memory)
+    now = time.monotonic_ns()
+    memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS * 7 // 10  # too early for the tick to run
+    for _ in range(100):
+        assert loop.tick_on_arrival(image, now) == 0
+    assert memory.shared[loop.DEADLINE_NS] == now + PERIOD_NS * 7 // 10 - 2_000
+
+
+def test_a_released_tissue_comes_to_rest_exactly_and_a_touch_ends_that(memory: loop.Memory) -> None:
+    assert memory.counters[loop.AT_REST_SINCE] == 0
+    for i in range(300):
+        command(memory, i, (0.0, 0.0, 1e-3))
+        tick(memory)
+        assert memory.counters[loop.AT_REST_SINCE] == -1
+    loop.forget_command(memory.commands, 0)
+    for _ in range(20_000):
+        tick(memory)
+        if memory.counters[loop.AT_REST_SINCE] >= 0:
+            break
+        assert np.any(memory.model.state)
+    np.testing.assert_array_equal(memory.model.state, 0)
+    ticks = int(memory.counters[loop.TICKS])
+    assert memory.counters[loop.AT_REST_SINCE] == ticks
+    np.testing.assert_array_less(np.abs(memory.record_motion[ticks - 500 : ticks, 0, 3:6]), 1e-9)
+    tick(memory)
+    np.testing.assert_array_equal(memory.model.state, 0)
+    assert memory.counters[loop.AT_REST_SINCE] == ticks
+    command(memory, 300, (0.0, 0.0, 1e-3))
+    tick(memory)
+    assert memory.counters[loop.AT_REST_SINCE] == -1
+
+
+def test_ticks_with_a_client_and_those_with_a_new_command_are_counted(memory: loop.Memory) -> None:
+    tick(memory)
+    np.testing.assert_array_equal(memory.tallies, [[0, 0]])
+    for i in range(10):
+        command(memory, i, (0.0, 0.0, 0.0))
+        tick(memory)
+        tick(memory)  # without a new one
+    np.testing.assert_array_equal(memory.tallies, [[20, 10]])
+    loop.forget_command(memory.commands, 0)
+    tick(memory)
+    np.testing.assert_array_equal(memory.tallies, [[20, 10]])
 
 
 def test_missed_ticks_are_made_up_for_and_too_many_are_skipped(memory: loop.Memory) -> None:

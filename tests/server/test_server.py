@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -45,10 +48,18 @@ class Query:
 
 
 @pytest.fixture
-def server(make_spring_mass_model: Callable[..., ReducedModel], tmp_path: Path) -> Server:
-    session: Any = None  # nothing here reaches the network
+def server(make_spring_mass_model: Callable[..., ReducedModel], tmp_path: Path) -> Iterator[Server]:
+    """Ticks, but is in no session."""
+    session: Any = None
     limits = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
-    return Server(make_spring_mass_model(2), limits, session, wire.Keys("test"), tmp_path)
+    server = Server(make_spring_mass_model(2), limits, session, wire.Keys("test"), tmp_path)
+    wake = os.eventfd(0)
+    thread = threading.Thread(target=server_module.loop.run_at_deadlines, args=(server.image, wake))
+    thread.start()
+    yield server
+    server_module.loop.stop(server.memory.shared)
+    thread.join()
+    os.close(wake)
 
 
 def test_a_mistake_of_the_servers_is_answered_too(server: Server, caplog: pytest.LogCaptureFixture) -> None:
@@ -64,13 +75,14 @@ def test_acquiring_gives_all_contacts_or_leaves_all_as_they_were(
     monkeypatch.setattr(server, "_check_alive", lambda client: None)
     server.leases.holders["tip1"] = "first"
     before = dict(server.leases.holders), dict(server.leases.terms)
-    server.memory.scale[1] = 1.0  # and no loop runs that could let it fade
+    monkeypatch.setattr(server_module.loop, "is_silent", lambda image, contact: contact == 0)
     request = {"contacts": ["tip", "tip1"], "frame": {"scale": 2.0}}
     with pytest.raises(Refused, match="fade") as refusal:
         server._carry_out("first", "acquire", request)
     assert refusal.value.reason == "busy"
     assert (server.leases.holders, server.leases.terms) == before
-    server.memory.scale[1] = 0.0
+    monkeypatch.undo()
+    monkeypatch.setattr(server, "_check_alive", lambda client: None)
     assert server._carry_out("first", "acquire", request)["contacts"] == ["tip", "tip1"]
     assert server.leases.holders == {"tip": "first", "tip1": "first"}
 
@@ -92,3 +104,35 @@ def test_while_forces_fade_for_a_new_hold_no_command_is_heard(
     server._carry_out("first", "acquire", {"contacts": ["tip", "tip1"]})
     assert heard == ["not_holder", "not_holder"]
     assert server._why_refused(command, "first") is None
+
+
+def test_too_many_waiting_queries_are_refused_at_once_and_a_lease_that_ends_is_heard_first(
+    server: Server,
+) -> None:
+    take = server._queue_query(server._answer_action)
+    queries: list[Any] = [Query("first", "explode", {}) for _ in range(server_module.MAX_WAITING + 1)]
+    for query in queries:
+        take(query)
+    assert [len(query.refusals) for query in queries] == [0] * server_module.MAX_WAITING + [1]
+    assert queries[-1].refusals[0]["reason"] == "busy"
+    order: list[str] = []
+    server._queue(server_module._LEASES_FIRST, lambda: order.append(str(len(queries[0].refusals))))
+    server._queue(server_module._END, lambda: None)
+    server._serve_events()
+    assert order == ["0"]  # before the first query was answered
+    assert {query.refusals[0]["reason"] for query in queries[:-1]} == {"unknown_action"}
+
+
+def test_without_a_tick_a_change_is_refused_and_the_next_one_waits_for_it(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_module, "_CHANGE_TIMEOUT_S", 0.05)
+    server.leases.holders["tip"] = "first"
+    server_module.loop.stop(server.memory.shared)
+    time.sleep(0.05)  # the tick under way is the last one
+    request = {"limits": {"max_force_n": 1.0}}
+    for _ in range(2):
+        with pytest.raises(Refused, match="no tick") as refusal:
+            server._carry_out("first", "limits", request)
+        assert refusal.value.reason == "busy"
+    assert server.leases.terms["tip"].limits.max_force_n == 10.0
