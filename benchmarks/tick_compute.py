@@ -1,17 +1,25 @@
 """What one tick costs: the block-diagonal kernel against BLAS matrix-vector products, then the whole tick and its message.
 
-    python benchmarks/tick_compute.py [--runs 7]
+    python benchmarks/tick_compute.py [--runs 21]
 
-The kernel and BLAS (through numba, so without Python between the calls) step the same model with the same inputs; the best
-of several runs is printed, in microseconds a step. `tick` is everything that runs at a deadline: input, safety, kernel,
-records; `encode` makes the force message; `allocated` counts what ten thousand ticks took from the heap of compiled code.
+The kernel and BLAS (through numba, so without Python between the calls; one thread) step the same model with the same inputs,
+in turns, their arrays aligned alike. Medians of several runs are printed, in microseconds a step; the ratio is that of the
+medians. `tick` is everything that runs at a deadline: input, safety, kernel, records; `encode` makes the force message;
+`allocated` counts what ten thousand ticks took from the heap of compiled code.
+
+What bounds the ratio is the memory that a step reads: order (order + n_inputs + n_outputs) numbers against order (n_inputs +
+n_outputs). `read` is the time to do no more with the matrices of the blocks (B, C, D) than to sum them up.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Callable
+from statistics import median
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read when numpy and scipy are imported
 
 import numpy as np
 from numba import njit
@@ -47,27 +55,51 @@ def run_blas(n, a, b, c, d, state, inputs, force, following, part_force, part_st
             state[i] = following[i] + part_state[i]
 
 
+@njit(fastmath=True)
+def run_reads(n, arrays):
+    for _ in range(n):
+        total = 0.0
+        for array in arrays:
+            for i in range(array.size):
+                total += array[i]
+        arrays[0][0] = total * 1e-300  # so that every pass has to be made
+
+
 @njit
-def run_ticks(n, image, start, period):
+def run_ticks(n, commands, image, start, period):
     for k in range(n):
-        loop.repeat_tick(image, start + k * period)
+        now = start + k * period
+        for contact in range(commands.versions.size):
+            depth = 1e-3 * (k % 64)
+            loop.write_command(commands, contact, k, 1, now, -1, (0.0, 0.0, depth), (0.0, 0.0, 0.0))
+        loop.repeat_tick(image, now)
 
 
-def best(runs: int, function: Callable[[], None]) -> float:
-    """Microseconds a step, the best of `runs`."""
-    times = []
+def allocations(function: Callable[[], None]) -> int:
+    _nrt.memsys_enable_stats()
+    before = rtsys.get_allocation_stats().alloc
+    function()
+    after = rtsys.get_allocation_stats().alloc
+    _nrt.memsys_disable_stats()
+    return after - before
+
+
+def in_turns(runs: int, *functions: Callable[[], object]) -> list[float]:
+    """Microseconds a step of each, medians of `runs`; what disturbs the machine meets them alike."""
+    times: list[list[float]] = [[] for _ in functions]
     for _ in range(runs):
-        started = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - started)
-    return min(times) / STEPS * 1e6
+        for function, measured in zip(functions, times, strict=True):
+            started = time.perf_counter()
+            function()
+            measured.append((time.perf_counter() - started) / STEPS * 1e6)
+    return [median(measured) for measured in times]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=7)
+    parser.add_argument("--runs", type=int, default=21)
     options = parser.parse_args()
-    print("order channels |  blocks    BLAS   ratio |    tick  encode | allocated")
+    print("order channels |    read  blocks    BLAS   ratio |    tick  encode | allocated")
     for order in (100, 200, 600):
         for contacts in (1, 10):
             row(order, contacts, options.runs)
@@ -77,44 +109,43 @@ def row(order: int, contacts: int, runs: int) -> None:
     model = spring_mass_model(contacts, order // 2)
     system, channels = model.discrete, 3 * contacts
     inputs = np.random.default_rng(0).normal(size=(64, channels)) * 1e-3
-    b_transposed = np.ascontiguousarray(system.b.T)
-    state, force = np.zeros(order), np.zeros(channels)
-    blocks_args = (system.diagonal, system.cross, b_transposed, system.c, system.d)
-    run_blocks(1, *blocks_args, state, inputs, force)
-    state[:] = 0
-    blocks = best(runs, lambda: run_blocks(STEPS, *blocks_args, state, inputs, force))
-
-    a, dense_state, dense_force = system.dense_a(), np.zeros(order), np.zeros(channels)
+    blocks = loop.make_model(system)
+    force = np.zeros(channels)
+    b, c, d = blocks.b_transposed, blocks.c, blocks.d
+    blocks_args = (blocks.diagonal, blocks.cross, b, c, d, blocks.state, inputs, force)
+    dense = [kernel.aligned(matrix) for matrix in (system.dense_a(), system.b, system.c, system.d)]
+    dense_state, dense_force = kernel.aligned(np.zeros(order)), np.zeros(channels)
     scratch = (np.zeros(order), np.zeros(channels), np.zeros(order))
-    dense_args = (a, system.b, system.c, system.d, dense_state, inputs, dense_force, *scratch)
-    run_blas(1, *dense_args)
-    dense_state[:] = 0
-    blas = best(runs, lambda: run_blas(STEPS, *dense_args))
-    np.testing.assert_allclose(state, dense_state, atol=1e-9 * np.abs(dense_state).max())
+    dense_args = (*dense, dense_state, inputs, dense_force, *scratch)
+    run_blocks(1000, *blocks_args)
+    run_blas(1000, *dense_args)
+    np.testing.assert_allclose(blocks.state, dense_state, atol=1e-9 * np.abs(dense_state).max())
+    np.testing.assert_allclose(force, dense_force, atol=1e-9 * np.abs(dense_force).max())
+    matrices = tuple(kernel.aligned(matrix.ravel()) for matrix in (b, c, d))
+    run_reads(1, matrices)
 
     limits = Limits(10.0, 2000.0, 1.0, 0.1, 4.0)
     memory = loop.make_memory(system, model.period_s, [limits] * contacts, 1 / 30)
-    image = make_image(memory)
-    start = time.monotonic_ns()
-    for contact in range(contacts):
-        loop.write_command(memory.commands, contact, 1, 1, start, -1, (0.0, 0.0, 1e-3), (0.0, 0.0, 0.0))
-    period = int(memory.period_ns[0])
-    run_ticks(1, image, start, period)
-    _nrt.memsys_enable_stats()
-    before = rtsys.get_allocation_stats()
-    run_ticks(STEPS, image, start, period)
-    after = rtsys.get_allocation_stats()
-    _nrt.memsys_disable_stats()
-    tick = best(runs, lambda: run_ticks(STEPS, image, start, period))
+    ticks_args = (memory.commands, make_image(memory), time.monotonic_ns(), int(memory.period_ns[0]))
+    run_ticks(1, *ticks_args)
+    entry, ticks = (allocations(lambda n=n: run_ticks(n, *ticks_args)) for n in (0, STEPS))
     encoder = wire.ForceEncoder(contacts)
 
     def encode() -> None:
         for k in range(STEPS):
-            encoder.encode(k, start, memory.record_inputs[0], memory.record_motion[0])
+            encoder.encode(k, k, memory.record_inputs[0], memory.record_motion[0])
 
+    reading, stepping, blas, tick, encoding = in_turns(
+        runs,
+        lambda: run_reads(STEPS, matrices),
+        lambda: run_blocks(STEPS, *blocks_args),
+        lambda: run_blas(STEPS, *dense_args),
+        lambda: run_ticks(STEPS, *ticks_args),
+        encode,
+    )
     print(
-        f"{order:5d} {channels:8d} | {blocks:7.2f} {blas:7.2f} {blas / blocks:7.1f} | "
-        f"{tick:7.2f} {best(runs, encode):7.2f} | {after.alloc - before.alloc}",
+        f"{order:5d} {channels:8d} | {reading:7.2f} {stepping:7.2f} {blas:7.2f} {blas / stepping:7.1f} | "
+        f"{tick:7.2f} {encoding:7.2f} | {ticks - entry}",
         flush=True,
     )
 

@@ -24,7 +24,7 @@ def test_block_diagonal_steps_equal_dense_matrix_products(
     b_transposed = np.ascontiguousarray(b.T)
     size = np.abs(c).max() * np.abs(b).max() * system.order + np.abs(d).max()
     for _ in range(200):
-        displacement = random.normal(size=b.shape[1])
+        displacement = random.normal(size=(b.shape[1],))
         kernel.output(c, d, state, displacement, force)
         np.testing.assert_allclose(force, c @ expected_state + d @ displacement, rtol=0, atol=1e-13 * size)
         kernel.update(system.diagonal, system.cross, b_transposed, state, displacement)
@@ -40,3 +40,15 @@ def test_a_step_does_not_change_its_input() -> None:
     np.testing.assert_array_equal(state, 1.0)
     kernel.update(np.ones(2), np.zeros(2), b_transposed, state, displacement)
     np.testing.assert_array_equal(displacement, 0.5)
+
+
+@pytest.mark.parametrize("shape", [(0,), (200,), (30, 200), (5, 7), (3, 0)])
+def test_an_aligned_copy_begins_on_a_cache_line_and_holds_the_same_numbers(shape: tuple[int, ...]) -> None:
+    values = np.random.default_rng(0).normal(size=shape)
+    for original in (values, np.asfortranarray(values)):  # rows and columns first
+        copy = kernel.aligned(original)
+        np.testing.assert_array_equal(copy, values)
+        assert copy.size == 0 or copy.ctypes.data % 64 == 0
+        assert copy.flags.c_contiguous
+        assert copy.flags.writeable
+        assert not np.shares_memory(copy, original)
