@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import tempfile
 import zipfile
 from dataclasses import asdict, dataclass, fields
@@ -13,6 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from palpate.files import write_whole
 
 FORMAT = "palpate.reduced-model"
 SCHEMA_VERSION = 1
@@ -232,7 +233,7 @@ def check_writable(path: Path) -> None:
 
 
 def save_model(model: ReducedModel, path: Path) -> None:
-    """Write the model to a temporary file beside `path`, then rename: readers see the old file or the whole new one."""
+    """Write the model; readers see the old file or the whole new one."""
     scalars = {
         "format": FORMAT,
         "schema_version": SCHEMA_VERSION,
@@ -258,18 +259,7 @@ def save_model(model: ReducedModel, path: Path) -> None:
         arrays |= {f"{group}_{f.name}": getattr(part, f.name) for f in fields(part)}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(buffer.getvalue())
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_whole(path, buffer.getvalue())
 
 
 def load_model(path: Path) -> ReducedModel:

@@ -127,7 +127,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--cpu",
-        type=int,
+        type=_index,
         metavar="N",
         help="keep the threads that run ticks on this processor (default: where the system puts them)",
     )
@@ -163,6 +163,13 @@ def _surface_rate(text: str) -> float:
     value = _positive(text)
     if value > FASTEST_SURFACE_HZ:
         raise argparse.ArgumentTypeError(f"{text} is above {FASTEST_SURFACE_HZ:g}")
+    return value
+
+
+def _index(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is below 0")
     return value
 
 

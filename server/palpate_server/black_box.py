@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import threading
 import time
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from palpate.files import write_whole
 from palpate_server import loop
 from palpate_server.safety import Flags
 
@@ -86,9 +88,9 @@ class BlackBox:
         motion = self.memory.record_motion[rows]
         path = self.folder / f"palpate-{self.session}-tick{head}-{cause}.npz"
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            buffer = io.BytesIO()
             np.savez(
-                path,
+                buffer,
                 contacts=np.array(self.contacts),
                 tick=ticks,
                 server_time_ns=times[:, loop.START_NS],
@@ -103,6 +105,7 @@ class BlackBox:
                 force_scale=motion[:, :, loop.SCALE],
                 energy_j=motion[:, :, loop.ENERGY_J],
             )
+            write_whole(path, buffer.getvalue())
         except OSError as error:
             log.warning("black box %s could not be written: %s", path, error)
         else:

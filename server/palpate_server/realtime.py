@@ -32,8 +32,8 @@ def pin(cpu: int) -> str | None:
     """Keep the calling thread on one processor, by its number; or say why not."""
     try:
         os.sched_setaffinity(0, {cpu})
-    except OSError as error:
-        return f"the loop is not kept on processor {cpu} ({error.strerror})"
+    except (OSError, OverflowError) as error:
+        return f"the loop is not kept on processor {cpu} ({error}): there may be fewer, or others are not allowed"
     return None
 
 

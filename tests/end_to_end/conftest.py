@@ -39,10 +39,16 @@ class ServedModel:
     process: subprocess.Popen[str]
     endpoint: str
     model: ReducedModel
+    before: list[str]
 
     def stop(self, number: int = signal.SIGTERM) -> int:
         self.process.send_signal(number)
         return self.process.wait(20)
+
+    def output(self) -> str:
+        """What it printed since it was serving, after its end; also what it printed before, on the way there."""
+        assert self.process.stdout is not None
+        return "".join(self.before) + self.process.stdout.read()
 
 
 @dataclass
@@ -150,9 +156,11 @@ def serve(
         processes.append(process)
         assert process.stdout is not None
         give_up = time.monotonic() + START_S
+        before: list[str] = []
         for line in process.stdout:
             if line.startswith("serving"):
-                return ServedModel(process, endpoint, model)
+                return ServedModel(process, endpoint, model, before)
+            before.append(line)
             assert time.monotonic() < give_up
         raise AssertionError("the server did not start")
 

@@ -432,12 +432,13 @@ def test_a_model_is_exchanged_while_a_client_presses_and_a_bad_file_leaves_the_o
 def test_describe_and_geometry_say_what_the_model_is(
     serve: Callable[..., Any], connect: Callable[..., Any]
 ) -> None:
-    served = serve("--max-force-n", "3.5")
+    served = serve("--max-force-n", "3.5", "--surface-hz", "60")
     surface = served.model.surface
     with connect(served.endpoint) as client:
         _, description = client.query("describe")
         assert description["schema_version"] == 1
         assert description["limits"]["max_force_n"] == 3.5
+        assert description["surface_period_s"] == 1 / 60
         assert [contact["name"] for contact in description["contacts"]] == ["tip"]
         assert description["model"]["evidence"]["band_hz"] == [0.0, 30.0]
         _, geometry = client.query("geometry")
@@ -458,6 +459,31 @@ def test_describe_and_geometry_say_what_the_model_is(
         )  # nobody pokes it
         ticks = [message["tick"] for message in surfaces]
         assert ticks == sorted(set(ticks))
+        assert min(np.diff(ticks)) == 17  # of a millisecond: the nearest to 60 Hz
+
+
+def test_the_threads_that_run_ticks_are_kept_on_the_processor_that_is_asked_for(
+    serve: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    cpu = max(os.sched_getaffinity(0))
+
+    def pinned(process: subprocess.Popen[str]) -> int:
+        tasks = Path(f"/proc/{process.pid}/task").iterdir()
+        return sum(f"Cpus_allowed_list:\t{cpu}\n" in (task / "status").read_text() for task in tasks)
+
+    served = serve("--cpu", str(cpu))
+    with connect(served.endpoint) as client:
+        assert client.acquire("tip")[0]
+        sequence = client.command({"tip": [0.0, 0.0, 0.0]})
+        wait_until(lambda: client.forces[-1]["sequence"][0] == sequence)
+        assert pinned(served.process) == 2  # the deadline loop and the thread that receives commands
+    assert served.stop() == 0
+
+    served = serve("--cpu", "1000")  # a processor that is not there is no reason not to serve
+    with connect(served.endpoint):
+        pass
+    assert served.stop() == 0
+    assert "not kept on processor 1000" in served.output()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
