@@ -1,12 +1,17 @@
 """How functions of the real-time path are compiled: cached on disk where that is possible, with and without the GIL."""
 
+# mypy: disable-error-code="no-untyped-call"
 from __future__ import annotations
 
+import hashlib
 import warnings
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from numba import njit
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -29,9 +34,33 @@ def compiled_exactly(function: Function) -> Function:
     return _compile(function, nogil=False, fast_math=set())
 
 
+class _Cache(FunctionCache):
+    """numba's cache on disk, out of date as soon as any file of this package has changed.
+
+    numba looks at the function's own file alone, though what it stores has the functions of other files in it.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        stamp = (self._impl.locator.get_source_stamp(), _package_digest())
+        self._cache_file = IndexDataCacheFile(self.cache_path, self._impl.filename_base, stamp)
+
+
+@cache
+def _package_digest() -> str:
+    """The hash of all names and contents of this package's source files."""
+    digest = hashlib.sha256()
+    folder = Path(__file__).parent
+    for path in sorted(folder.rglob("*.py")):
+        source = path.read_bytes()
+        digest.update(f"{path.relative_to(folder)} {len(source)}\n".encode() + source)
+    return digest.hexdigest()
+
+
 def _compile(function: Function, *, nogil: bool, fast_math: set[str] = FAST_MATH) -> Function:
+    dispatcher: Any = njit(nogil=nogil, fastmath=fast_math)(function)
     try:
-        return cast(Function, njit(cache=True, nogil=nogil, fastmath=fast_math)(function))
+        dispatcher._cache = _Cache(function)
     except (
         RuntimeError
     ) as error:  # no cache directory is writable: a read-only container, another user's files
@@ -41,4 +70,4 @@ def _compile(function: Function, *, nogil: bool, fast_math: set[str] = FAST_MATH
             RuntimeWarning,
             stacklevel=3,
         )
-        return cast(Function, njit(cache=False, nogil=nogil, fastmath=fast_math)(function))
+    return cast(Function, dispatcher)
