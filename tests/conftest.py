@@ -9,6 +9,35 @@ import pytest
 from palpate.model import ReducedModel
 from palpate_server.sample_model import spring_mass_model
 
+SLAB = """
+name = "slab"
+[geometry]
+shape = "box"
+upper_m = [0.06, 0.06, 0.03]
+counts = [7, 7, 4]
+jitter = 0.1
+[material]
+preset = "liver"
+[[fixed]]
+region = "plane"
+point_m = [0.0, 0.0, 0.0001]
+normal = [0.0, 0.0, -1.0]
+"""
+
+
+@pytest.fixture(scope="session")
+def slab_scene() -> Callable[..., str]:
+    """A bonded slab that builds in a second, with a contact for each (name, x, radius), m, on its upper side."""
+
+    def scene(*contacts: tuple[str, float, float], more: str = "") -> str:
+        tables = (
+            f'[[contact]]\nname = "{name}"\npoint_m = [{x}, 0.03, 0.03]\nradius_m = {radius}\n'
+            for name, x, radius in contacts or [("tip", 0.03, 0.011)]
+        )
+        return SLAB + "".join(tables) + more
+
+    return scene
+
 
 @pytest.fixture(scope="session")
 def make_spring_mass_model() -> Callable[..., ReducedModel]:

@@ -30,6 +30,10 @@ _COUNTERS = {
     "accepted": "commands carried out",
 }
 _DURATIONS = ("timer_lateness_s", "tick_lateness_s", "compute_time_s", "input_age_s")
+_RATES = {
+    "success_rate": "share of the last 100 ticks with a new command in time",
+    "success_rate_since_start": "share of the ticks with a client that had a new command in time",
+}
 
 
 class StatusCollector(Collector):
@@ -63,23 +67,12 @@ class StatusCollector(Collector):
                 if value is not None:
                     gauge.add_metric([quantile], value)
             yield gauge
-        rate = GaugeMetricFamily(
-            "palpate_success_rate",
-            "share of the last 100 ticks with a new command in time",
-            labels=["contact"],
-        )
-        for contact, state in status["contacts"].items():
-            rate.add_metric([contact], state["success_rate"])
-        yield rate
-        since_start = GaugeMetricFamily(
-            "palpate_success_rate_since_start",
-            "share of the ticks with a client that had a new command in time",
-            labels=["contact"],
-        )
-        for contact, state in status["contacts"].items():
-            if state["success_rate_since_start"] is not None:
-                since_start.add_metric([contact], state["success_rate_since_start"])
-        yield since_start
+        for name, text in _RATES.items():
+            rate = GaugeMetricFamily(f"palpate_{name}", text, labels=["contact"])
+            for contact, state in status["contacts"].items():
+                if state[name] is not None:
+                    rate.add_metric([contact], state[name])
+            yield rate
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -7,9 +7,11 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -120,6 +122,23 @@ class RawClient:
         }
         self.put(msgpack.packb(message))
         return sequence
+
+    @contextmanager
+    def pressing(self, displacement_m: dict[str, list[float]]) -> Iterator[None]:
+        """A command each millisecond from a thread of its own."""
+        stop = threading.Event()
+
+        def press() -> None:
+            while not stop.wait(0.001):
+                self.command(displacement_m)
+
+        thread = threading.Thread(target=press)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
 
     def next_status(self) -> dict[str, Any]:
         """The second status from now: the first may have been made before."""

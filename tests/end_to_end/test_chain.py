@@ -6,7 +6,7 @@ import json
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
 
@@ -19,39 +19,16 @@ from palpate.model import ReducedModel, load_model
 from palpate.plots import Touch
 from palpate.reduction.evidence import step_through
 
-SLAB = """
-name = "slab"
-[geometry]
-shape = "box"
-upper_m = [0.06, 0.06, 0.03]
-counts = [7, 7, 4]
-jitter = 0.1
-[material]
-preset = "liver"
-[[fixed]]
-region = "plane"
-point_m = [0.0, 0.0, 0.0001]
-normal = [0.0, 0.0, -1.0]
-[[contact]]
-name = "left"
-point_m = [0.02, 0.03, 0.03]
-radius_m = 0.006
-[[contact]]
-name = "right"
-point_m = [0.05, 0.03, 0.03]
-radius_m = 0.006
-[reduction]
-tolerance = 0.02
-"""
-
 
 @pytest.fixture(scope="module")
 def recorded(
-    tmp_path_factory: pytest.TempPathFactory,
+    tmp_path_factory: pytest.TempPathFactory, slab_scene: Callable[..., str]
 ) -> Iterator[tuple[ReducedModel, Touch, dict[str, object]]]:
     """A slab built, served in one process and poked at its second contact by the headless client in another."""
     folder = tmp_path_factory.mktemp("chain")
-    (folder / "slab.toml").write_text(SLAB)
+    (folder / "slab.toml").write_text(
+        slab_scene(("left", 0.02, 0.006), ("right", 0.05, 0.006), more="[reduction]\ntolerance = 0.02\n")
+    )
     build = [sys.executable, "-m", "palpate.cli", "build", "slab.toml"]
     subprocess.run(build, cwd=folder, check=True, capture_output=True, timeout=120)
     model = load_model(folder / "slab.npz")

@@ -2,30 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from matplotlib.image import imread
 
 from palpate.demo import run_demo
-
-SLAB = """
-name = "slab"
-[geometry]
-shape = "box"
-upper_m = [0.06, 0.06, 0.03]
-counts = [7, 7, 4]
-[material]
-preset = "liver"
-[[fixed]]
-region = "plane"
-point_m = [0.0, 0.0, 0.0001]
-normal = [0.0, 0.0, -1.0]
-[[contact]]
-name = "tip"
-point_m = [0.03, 0.03, 0.03]
-radius_m = 0.011
-"""
 
 
 class Stages:
@@ -41,9 +24,11 @@ class Stages:
         pass
 
 
-def test_the_demonstration_ends_with_forces_and_a_picture_and_builds_once(tmp_path: Path) -> None:
+def test_the_demonstration_ends_with_forces_and_a_picture_and_builds_once(
+    tmp_path: Path, slab_scene: Callable[..., str]
+) -> None:
     scene = tmp_path / "slab.toml"
-    scene.write_text(SLAB)
+    scene.write_text(slab_scene())
     first = Stages()
     demo = run_demo(scene, tmp_path / "out", 1.0, first)
     assert any(name.startswith("reduction") for name in first.names)
@@ -61,7 +46,7 @@ def test_the_demonstration_ends_with_forces_and_a_picture_and_builds_once(tmp_pa
     run_demo(scene, tmp_path / "out", 1.0, again)
     assert not any(name.startswith("reduction") for name in again.names)
 
-    scene.write_text(SLAB.replace("radius_m = 0.011", "radius_m = 0.015"))
+    scene.write_text(slab_scene(("tip", 0.03, 0.015)))
     changed = Stages()
     run_demo(scene, tmp_path / "out", 1.0, changed)
     assert any(name.startswith("reduction") for name in changed.names)

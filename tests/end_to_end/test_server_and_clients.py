@@ -13,7 +13,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 import urllib.request
 from collections.abc import Callable
@@ -334,22 +333,11 @@ def test_a_client_that_goes_on_commanding_may_acquire_its_contact_again(
     served = serve(n_contacts=2)
     with connect(served.endpoint) as client:
         assert client.acquire("tip")[0]
-        stop = threading.Event()
-
-        def press() -> None:
-            while not stop.wait(0.001):
-                client.command({"tip": [0.0, 0.0, -0.004]})
-
-        thread = threading.Thread(target=press)
-        thread.start()
-        try:
+        with client.pressing({"tip": [0.0, 0.0, -0.004]}):
             wait_until(lambda: client.forces[-1]["force_scale"][0] == 1)
             granted, answer = client.acquire("tip1", "tip")
             assert granted, answer
             wait_until(lambda: client.forces[-1]["force_scale"][0] == 1)
-        finally:
-            stop.set()
-            thread.join()
         contacts = client.next_status()["contacts"]
         assert [contacts[name]["holder"] for name in ("tip", "tip1")] == [client.name] * 2
 
@@ -381,15 +369,7 @@ def test_a_model_is_exchanged_while_a_client_presses_and_a_bad_file_leaves_the_o
     (tmp_path / "circle.npz").symlink_to(tmp_path / "circle.npz")
     with connect(served.endpoint) as client:
         assert client.acquire("tip")[0]
-        stop = threading.Event()
-
-        def press() -> None:
-            while not stop.wait(0.001):
-                client.command({"tip": [0.0, 0.0, -0.004]})
-
-        thread = threading.Thread(target=press)
-        thread.start()
-        try:
+        with client.pressing({"tip": [0.0, 0.0, -0.004]}):
             wait_until(lambda: client.forces[-1]["force_scale"][0] == 1)
             before = client.next_status()
             for name in (
@@ -413,9 +393,6 @@ def test_a_model_is_exchanged_while_a_client_presses_and_a_bad_file_leaves_the_o
             assert client.control("load", {"model": "other.npz"}) == (True, answer)
             last = len(client.forces)
             after = client.next_status()
-        finally:
-            stop.set()
-            thread.join()
         assert client.query("describe")[1]["model"]["name"] == "other"
         messages = client.forces[first - 1 : last]
         assert len(messages) > 100

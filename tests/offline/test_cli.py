@@ -5,28 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-SLAB = """
-name = "slab"
-[geometry]
-shape = "box"
-upper_m = [0.06, 0.06, 0.03]
-counts = [7, 7, 4]
-jitter = 0.1
-[material]
-preset = "liver"
-[[fixed]]
-region = "plane"
-point_m = [0.0, 0.0, 0.0001]
-normal = [0.0, 0.0, -1.0]
-[[contact]]
-name = "tip"
-point_m = [0.03, 0.03, 0.03]
-radius_m = 0.011
-"""
 
 
 def palpate(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -41,10 +23,10 @@ def palpate(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def slab(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def slab(tmp_path_factory: pytest.TempPathFactory, slab_scene: Callable[..., str]) -> tuple[Path, str]:
     """A folder with slab.toml and the slab.npz built from it, and what the build printed."""
     folder = tmp_path_factory.mktemp("slab")
-    (folder / "slab.toml").write_text(SLAB)
+    (folder / "slab.toml").write_text(slab_scene())
     done = palpate("build", "slab.toml", folder=folder)
     assert done.returncode == 0, done.stderr
     return folder, done.stdout
@@ -147,9 +129,9 @@ def test_a_mistake_ends_in_one_plain_message_and_exit_code_2(
     ],
 )  # fmt: skip
 def test_a_scene_that_makes_no_sense_is_refused_by_the_name_of_its_part(
-    tmp_path: Path, old: str, new: str, says: str
+    tmp_path: Path, slab_scene: Callable[..., str], old: str, new: str, says: str
 ) -> None:
-    (tmp_path / "odd.toml").write_text(SLAB.replace(old, new))
+    (tmp_path / "odd.toml").write_text(slab_scene().replace(old, new))
     done = palpate("build", "odd.toml", folder=tmp_path)
     assert done.returncode == 2
     assert says in done.stderr
@@ -166,8 +148,10 @@ def test_programs_that_palpate_starts_show_their_own_help_under_its_name(
     assert done.stdout.startswith(f"usage: palpate {command}")
 
 
-def test_a_scene_that_can_not_be_built_leaves_no_file(slab: tuple[Path, str], tmp_path: Path) -> None:
-    elastic = SLAB.replace('preset = "liver"', 'preset = "liver"\ngamma = []\ntau_s = []')
+def test_a_scene_that_can_not_be_built_leaves_no_file(
+    slab: tuple[Path, str], tmp_path: Path, slab_scene: Callable[..., str]
+) -> None:
+    elastic = slab_scene().replace('preset = "liver"', 'preset = "liver"\ngamma = []\ntau_s = []')
     (tmp_path / "elastic.toml").write_text(elastic)
     done = palpate("build", "elastic.toml", folder=tmp_path)
     assert done.returncode == 2
