@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 # The loop's process has no use for a pool of linear algebra threads; to be said before numpy is loaded.
@@ -51,6 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         keys = wire.Keys(options.session)
         model = load_model(options.model)
+        if options.recordings is not None:
+            _prepare_recordings(options.recordings)
         with transport.open_session(options.listen, options.zenoh_config) as session:
             where = options.zenoh_config or options.listen
             contacts = ", ".join(contact.name for contact in model.contacts)
@@ -73,12 +76,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 options.black_box,
                 options.surface_hz,
                 options.cpu,
+                options.recordings,
             )
     except (OSError, ModelFileError, transport.TransportError, ValueError) as error:
         print(f"palpate serve: {error}", file=sys.stderr)
         return EXIT_REFUSED
     print("stopped", flush=True)
     return 0
+
+
+def _prepare_recordings(folder: Path) -> None:
+    """Raises OSError when there is no such folder and it can't be made, ValueError when nothing could write to it."""
+    if find_spec("mcap") is None:
+        raise ValueError("--recordings needs the package mcap: install palpate[recorder]")
+    folder.mkdir(parents=True, exist_ok=True)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -117,6 +128,12 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FOLDER",
         help="write the last two seconds there after a fault, a stale input or a storm of limits",
+    )
+    parser.add_argument(
+        "--recordings",
+        type=Path,
+        metavar="FOLDER",
+        help="where clients may have the session recorded to (extra `recorder`; default: they may not)",
     )
     parser.add_argument(
         "--surface-hz",

@@ -386,8 +386,8 @@ def changed_at(image: Image) -> int:
 
 
 @compiled
-def _take_up_change(image: Image) -> None:
-    """Carry out what is in the slot. Called with the tick lock held; afterwards the image may be another."""
+def take_up_change(image: Image) -> None:
+    """Carry out what is in the slot. Called with the tick lock held, or in a replay; afterwards the image may be another."""
     m = _memory(image)
     kind = load_acquire(m.shared, CHANGE)
     if kind == NO_CHANGE:
@@ -418,7 +418,7 @@ def _take_up_change(image: Image) -> None:
 @compiled
 def repeat_tick(image: Image, start_ns: int) -> None:
     """Run the next tick as if it began at `start_ns`: for replays, where no other thread is at work."""
-    _take_up_change(image)
+    take_up_change(image)
     _run_tick(_memory(image), start_ns, start_ns, False)
 
 
@@ -460,7 +460,7 @@ def tick_on_arrival(image: Image, arrival_ns: int) -> int:
         store_release(m.shared, DEADLINE_NS, deadline)
     ticks = 0
     if arrival_ns >= deadline - period // 2:
-        _take_up_change(image)
+        take_up_change(image)
         _run_due_ticks(_memory(image), arrival_ns)
         ticks = m.counters[TICKS] - before
         m.counters[TICKS_ON_ARRIVAL] += 1
@@ -484,7 +484,7 @@ def run_at_deadlines(image: Image, event_fd: int) -> None:
             continue
         if compare_and_swap(m.shared, LOCK, 0, 1):
             if m.shared[DEADLINE_NS] <= now:
-                _take_up_change(image)
+                take_up_change(image)
                 _run_due_ticks(_memory(image), now)  # the image is another after an exchange
             store_release(m.shared, LOCK, 0)
             _eventfd_write(event_fd, 1)

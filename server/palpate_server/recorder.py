@@ -33,12 +33,8 @@ _PIPE_BYTES = 65536  # that a pipe takes at once
 _LONGEST_NAME = 255  # bytes, on the usual file systems
 
 
-def file_in(folder: Path | None, name: object) -> Path:
-    """Where a client's recording goes. Raises Refused when there is no folder, or it is no plain name of an MCAP file."""
-    if folder is None:
-        raise Refused(
-            "no_recordings", "the server was started without a folder for recordings (--recordings)"
-        )
+def file_in(folder: Path, name: object) -> Path:
+    """Where a client's recording goes. Raises Refused when that is no plain name of an MCAP file."""
     if (
         not isinstance(name, str)
         or not name.endswith(".mcap")
@@ -76,7 +72,7 @@ class Recorder:
         self._unwritten = bytearray()
         self._wall_clock_ns = time.time_ns() - time.monotonic_ns()
         self._ending = threading.Event()
-        self._put("describe", keys.describe, wire.pack(description))
+        self._hand_over(time.monotonic_ns(), "describe", keys.describe, wire.pack(description))
         try:
             with path.open("xb") as stream:
                 self._process = subprocess.Popen(
@@ -149,10 +145,13 @@ class Recorder:
         for time_ns, kind, key, payload in self._waiting:
             if time_ns > last_tick_ns and not everything:
                 break
-            self._unwritten += msgpack.packb((kind, key, time_ns + self._wall_clock_ns, payload))
+            self._hand_over(time_ns, kind, key, payload)
             count += 1
         del self._waiting[:count]
-        self.messages += count
+
+    def _hand_over(self, time_ns: int, kind: str, key: str, payload: bytes) -> None:
+        self._unwritten += msgpack.packb((kind, key, time_ns + self._wall_clock_ns, payload))
+        self.messages += 1
 
     def _take_ticks(self) -> list[tuple[int, str, str, bytes]]:
         memory = self._memory

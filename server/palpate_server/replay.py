@@ -2,6 +2,9 @@
 
     python -m palpate_server.replay RECORDING.mcap MODEL.npz
 
+What is repeated begins where everything is known to be at rest, and breaks off where a message was lost, the model was
+reset or another one loaded; from the next rest on it is repeated again.
+
 Exit code 0: every tick gave the recorded displacement and force exactly. 1: one did not. 2: it can't be replayed.
 """
 
@@ -13,19 +16,22 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
+from numpy.typing import NDArray
 
 from palpate.model import ModelFileError, ReducedModel, load_model
-from palpate_server import loop, wire
-from palpate_server.frames import read_frame
+from palpate_server import loop, safety, wire
+from palpate_server.frames import Frame, read_frame
 from palpate_server.image import Image, make_image
 from palpate_server.safety import Flags, Limits
 
 _OF_THE_TICK = int(Flags.LATE | Flags.CAUGHT_UP)  # depend on the machine, not on the model
+_LIMITED = int(Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED)
+Agreed = TypeVar("Agreed", Limits, Frame)
 
 
 class ReplayError(ValueError):
@@ -44,12 +50,15 @@ class Session:
 
 @dataclass(frozen=True)
 class Comparison:
-    """ticks compared, the first that differed with what was recorded and what came out, or None; and lost_commands.
+    """ticks compared, in so many stretches; the first that differed with what was recorded and what came out, or None;
+    and lost_commands, how many ticks used one that is not in the recording.
 
-    Commands are best effort: of one that the recorder missed, the displacement that was really applied is used.
+    Commands are best effort: instead of one that the recorder missed, the displacement that was really applied is used,
+    which is the same when no limit was met.
     """
 
     ticks: int
+    stretches: int
     difference: str | None
     lost_commands: int
 
@@ -99,77 +108,141 @@ def _add_command(session: Session, message: dict[str, Any]) -> None:
 
 
 def compare(session: Session, model: ReducedModel) -> Comparison:
-    """Repeat every tick until the first lost message, reset or change of model. Raises ReplayError."""
+    """Repeat every tick that follows a known rest without a break. Raises ReplayError."""
     names = [contact["name"] for contact in session.description["contacts"]]
-    if session.description["model"]["config_sha256"] != model.config_sha256 or names != [
-        contact.name for contact in model.contacts
-    ]:
+    models = [session.description["model"], *(status["model"] for status in session.statuses)]
+    if names != [contact.name for contact in model.contacts] or not any(_is(m, model) for m in models):
         raise ReplayError(
             f"the recording is of {session.description['model']['name']!r}, this model is {model.name!r}, "
             "from another configuration"
         )
-    if np.any(session.forces[0]["force_scale"]):
+    at_rest = _known_rest(session, model)
+    if not at_rest.any():
         raise ReplayError(
-            "the recording begins in the middle of a movement: start it before the first command"
+            "the tissue was never at rest in this recording: start it before the first command, or reset the model first"
         )
-    ceiling = Limits(**session.description["limits"])
-    memory = loop.make_memory(model.discrete, model.period_s, [ceiling] * len(names), 1.0)
-    image = make_image(memory)
-    first = session.forces[0]["tick"]
-    memory.counters[loop.TICKS] = memory.shared[loop.HEAD] = first
-    end = min(
-        (s["undisturbed_since_tick"] for s in session.statuses if s["undisturbed_since_tick"] > first),
-        default=None,
-    )
-    terms = {
-        (state["since_tick"], index): state
-        for status in session.statuses
-        for index, state in enumerate(status["contacts"][name] for name in names)
-    }
-    compared = lost = 0
+    disturbed = {status["undisturbed_since_tick"] for status in session.statuses}
+    told_until = max(
+        status["ticks"] for status in session.statuses
+    )  # afterwards there may have been a change
+    terms = _Terms(session, names)
+    memory: loop.Memory | None = None
+    compared = stretches = lost = 0
     for k, message in enumerate(session.forces):
         tick = message["tick"]
-        if tick != first + k or tick == end:
+        if tick >= told_until:
             break
-        start_ns = message["server_time_ns"]
+        if tick in disturbed or (k > 0 and tick != session.forces[k - 1]["tick"] + 1):
+            memory = None
+        missing = [_is_missing(session, i, name, message) for i, name in enumerate(names)]
+        if any(m and flags & _LIMITED for m, flags in zip(missing, message["flags"], strict=True)):
+            memory = None  # where it wanted the tip to be is not known
+            continue
+        if memory is None:
+            if not at_rest[k]:
+                continue
+            memory = _memory_at_rest(session, model, k)
+            image = make_image(memory)
+            terms.agree_on_latest(image, tick)
+            stretches += 1
+        else:
+            terms.agree(image, tick)
         for i, name in enumerate(names):
-            if tick == first:
-                earlier = [since for since, index in terms if index == i and since <= first]
-                state = terms.get((max(earlier, default=-1), i))
-                _agree(image, i, state and state | {"held_since_tick": state["since_tick"]})
-            else:
-                _agree(image, i, terms.get((tick, i)))
-            lost += not _hand_over(session, memory, i, name, message)
-        loop.repeat_tick(image, start_ns)
+            _hand_over(session, memory, i, name, message)
+        loop.repeat_tick(image, message["server_time_ns"])
         compared += 1
-        row = tick % loop.RECORDS
-        if difference := _difference(message, memory, row):
-            return Comparison(compared, f"tick {tick}: {difference}", lost)
-    return Comparison(compared, None, lost)
+        lost += sum(missing)
+        if difference := _difference(message, memory, tick % loop.RECORDS):
+            return Comparison(compared, stretches, f"tick {tick}: {difference}", lost)
+    return Comparison(compared, stretches, None, lost)
 
 
-def _agree(image: Image, contact: int, state: dict[str, Any] | None) -> None:
-    if state is None:
-        return
-    loop.set_limits(image, contact, np.array(Limits(**state["limits"])))
-    if state.get("held_since_tick", state["since_tick"]) != state["since_tick"]:
-        return  # other limits in the middle of a hold: the tip stays where it is
-    frame = read_frame(state["frame"])
-    loop.set_frame(image, contact, np.array(frame.rotation), frame.scale, np.array(frame.origin_m))
+def _is(told: dict[str, Any], model: ReducedModel) -> bool:
+    """Whether a description's or status's `model` is this one."""
+    return bool(told["config_sha256"] == model.config_sha256 and told["order"] == model.order)
+
+
+def _known_rest(session: Session, model: ReducedModel) -> NDArray[np.bool_]:
+    """(forces,), whether this model and all tips were exactly at rest, in the frames of a status, before the tick."""
+    ticks = np.array([message["tick"] for message in session.forces])
+    known = np.zeros(len(ticks), bool)
+    for status in session.statuses:
+        since = status["at_rest_since_tick"]
+        if since < 0 or not _is(status["model"], model):
+            continue
+        since = max(since, *(state["since_tick"] for state in status["contacts"].values()))
+        known |= (since <= ticks) & (ticks < status["ticks"])
+    return known
+
+
+def _memory_at_rest(session: Session, model: ReducedModel, k: int) -> loop.Memory:
+    """The loop's memory before the k-th recorded tick; with the forces before it, which a device may still be rendering."""
+    limits = Limits(**session.description["limits"])
+    memory = loop.make_memory(model.discrete, model.period_s, [limits] * len(model.contacts), 1.0)
+    memory.counters[loop.TICKS] = memory.shared[loop.HEAD] = session.forces[k]["tick"]
+    for message in session.forces[max(0, k - loop.RECORDS + 1) : k]:
+        memory.record_motion[message["tick"] % loop.RECORDS, :, 3:6] = message["force_n"]
+    return memory
+
+
+class _Terms:
+    """Which limits and frames held from which tick on, as the statuses of a recording tell."""
+
+    def __init__(self, session: Session, names: Sequence[str]) -> None:
+        self._limits: list[dict[int, Limits]] = [{} for _ in names]
+        self._frames: list[dict[int, Frame]] = [{} for _ in names]
+        for status in session.statuses:
+            for contact, state in enumerate(status["contacts"][name] for name in names):
+                self._limits[contact][state["since_tick"]] = Limits(**state["limits"])
+                self._frames[contact][state["held_since_tick"]] = read_frame(state["frame"])
+
+    def agree(self, image: Image, tick: int) -> None:
+        """What changes before this tick."""
+        for contact, (limits, frames) in enumerate(zip(self._limits, self._frames, strict=True)):
+            _agree(image, contact, limits.get(tick), frames.get(tick))
+
+    def agree_on_latest(self, image: Image, tick: int) -> None:
+        """What holds at this tick, which everything begins at rest."""
+        for contact, (limits, frames) in enumerate(zip(self._limits, self._frames, strict=True)):
+            _agree(image, contact, _latest(limits, tick), _latest(frames, tick))
+
+
+def _latest(since: dict[int, Agreed], tick: int) -> Agreed | None:
+    return since.get(max((first for first in since if first <= tick), default=-1))
+
+
+def _agree(image: Image, contact: int, limits: Limits | None, frame: Frame | None) -> None:
+    if limits is not None:
+        loop.set_limits(image, contact, np.array(limits))
+        loop.take_up_change(image)
+    if frame is not None:
+        rotation, origin = np.array(frame.rotation), np.array(frame.origin_m)
+        loop.set_frame(image, contact, rotation, frame.scale, origin)
+        loop.take_up_change(image)
+
+
+def _find(session: Session, contact: int, message: dict[str, Any]) -> wire.Command | None:
+    return session.commands.get((message["sequence"][contact], message["client_time_ns"][contact]))
+
+
+def _is_missing(session: Session, contact: int, name: str, message: dict[str, Any]) -> bool:
+    """Whether the tick used a command for this contact, not an outdated one, that the recording has not."""
+    if message["sequence"][contact] < 0 or message["input_age_ns"][contact] > safety.HOLD_NS:
+        return False
+    command = _find(session, contact, message)
+    return command is None or name not in command.displacement_m
 
 
 def _hand_over(
     session: Session, memory: loop.Memory, contact: int, name: str, message: dict[str, Any]
-) -> bool:
-    """Put the command that the recorded tick used where the repeated tick will find it; False when it is missing."""
-    sequence = message["sequence"][contact]
+) -> None:
+    """Put the command that the recorded tick used, or one like it, where the repeated tick will find it."""
+    sequence, client_time_ns = message["sequence"][contact], message["client_time_ns"][contact]
     if sequence < 0:
         loop.forget_command(memory.commands, contact)
-        return True
-    client_time_ns = message["client_time_ns"][contact]
-    command = session.commands.get((sequence, client_time_ns))
-    known = command is not None and name in command.displacement_m
-    if command is None or not known:
+        return
+    command = _find(session, contact, message)
+    if command is None or name not in command.displacement_m:
         applied = tuple(message["displacement_m"][contact])
         command = wire.Command(sequence, client_time_ns, {name: applied}, {name: wire.STILL})
     loop.write_command(
@@ -182,7 +255,6 @@ def _hand_over(
         command.displacement_m[name],
         command.velocity_m_per_s[name],
     )
-    return known
 
 
 def _difference(message: dict[str, Any], memory: loop.Memory, row: int) -> str | None:
@@ -215,7 +287,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(
             f"{result.lost_commands} ticks used a command that the recording has not: their displacement was used"
         )
-    print(f"{result.ticks} of {total} recorded ticks repeated: ", end="")
+    where = "" if result.stretches == 1 else f", in {result.stretches} stretches"
+    print(f"{result.ticks} of {total} recorded ticks repeated{where}: ", end="")
     print("every force is the same, bit for bit" if result.difference is None else result.difference)
     return 0 if result.difference is None else 1
 

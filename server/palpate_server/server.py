@@ -25,6 +25,7 @@ from palpate_server.devices import PROFILES, Device, limits_for, warnings_for
 from palpate_server.frames import Frame, read_frame
 from palpate_server.image import make_image
 from palpate_server.leases import Leases, Refused, Terms
+from palpate_server.recorder import Recorder, file_in
 from palpate_server.safety import Flags, Limits
 
 log = logging.getLogger("palpate_server")
@@ -47,7 +48,8 @@ class Server:
     the GIL), one that sends the forces of its ticks, one for queries and leases, one for the surface. The thread that
     calls `publish_status` sends the status.
 
-    cpu: to keep the threads that run ticks on, or None to leave that to the system.
+    cpu: to keep the threads that run ticks on, or None to leave that to the system. recordings: the folder that clients
+    may have recordings made in, or None.
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class Server:
         black_box: Path | None = None,
         surface_hz: float = USUAL_SURFACE_HZ,
         cpu: int | None = None,
+        recordings: Path | None = None,
     ) -> None:
         self.model = model
         self.limits = limits
@@ -75,6 +78,10 @@ class Server:
         self.image = make_image(self.memory)
         self._models = models
         self._cpu = cpu
+        self._recordings = recordings
+        self._recorder: Recorder | None = None
+        self._recording = threading.Lock()  # is being started or ended
+        self._publishing = threading.Lock()  # a status
         self._changing = threading.Lock()  # the loop has one slot for changes
         self._model_in_use = (
             threading.Lock()
@@ -156,6 +163,8 @@ class Server:
         self._stopping.set()
         self._queue(_END, lambda: None)
         self._threads[0].join()
+        if self._recording.acquire(timeout=1.0) and self._recorder is not None:
+            self._recorder.stop()
         os.eventfd_write(self._wake, 1)
         for thread in self._threads[1:]:
             thread.join()
@@ -175,14 +184,18 @@ class Server:
             )  # whether it may has been said by the loop's thread
         messages = self.messages
         payload = sample.payload
+        key = str(sample.key_expr)
         try:
             if len(payload) > wire.MAX_COMMAND_BYTES:
                 raise wire.MalformedMessage("too_large", f"payload has {len(payload)} bytes")
-            command = wire.decode_command(payload.to_bytes())
+            content = payload.to_bytes()
+            if (recorder := self._recorder) is not None:
+                recorder.command(key, content)
+            command = wire.decode_command(content)
         except wire.MalformedMessage as error:
             messages.malformed[error.reason] += 1
             return
-        if reason := self._why_refused(command, wire.last_chunk(str(sample.key_expr))):
+        if reason := self._why_refused(command, wire.last_chunk(key)):
             messages.refused[reason] += 1
             return
         messages.accepted += 1
@@ -266,20 +279,27 @@ class Server:
     def publish_status(self) -> None:
         """Send the status, and see whether the black box has cause to write. No mistake in it ends the service."""
         try:
-            self._publish_status()
+            with self._publishing:
+                self._publish_status()
         except Exception:
             log.exception("the status could not be sent")
 
     def _publish_status(self) -> None:
+        recorder = self._recorder
         status = telemetry.status(
             self._state,
             time.monotonic_ns(),
+            self.model,
             self.memory,
             self.messages,
             self.leases,
             self._undisturbed_since_tick,
+            None if recorder is None else recorder.report(),
         )
-        self._status.put(wire.pack(status))
+        payload = wire.pack(status)
+        self._status.put(payload)
+        if recorder is not None:
+            recorder.status(payload)
         if self._black_box is not None:
             self._black_box.examine()
 
@@ -329,8 +349,10 @@ class Server:
 
     def _answer_describe(self, query: zenoh.Query) -> None:
         with query:
-            description = describe(self.model, self.limits, self.keys.session, self.surface_period_s)
-            query.reply(self.keys.describe, wire.pack(description), encoding=wire.ENCODING)
+            query.reply(self.keys.describe, wire.pack(self._describe()), encoding=wire.ENCODING)
+
+    def _describe(self) -> dict[str, Any]:
+        return describe(self.model, self.limits, self.keys.session, self.surface_period_s)
 
     def _answer_geometry(self, query: zenoh.Query) -> None:
         with query:
@@ -339,8 +361,9 @@ class Server:
             query.reply(self.keys.geometry, payload, encoding=wire.ENCODING)
 
     def _answer_control(self, query: zenoh.Query) -> None:
-        if wire.client_and_action(str(query.key_expr))[1] == "load":  # takes its time, and changes no lease
-            threading.Thread(target=self._answer_action, args=(query,), name="load", daemon=True).start()
+        action = wire.client_and_action(str(query.key_expr))[1]
+        if action in ("load", "record"):  # take their time, and change no lease
+            threading.Thread(target=self._answer_action, args=(query,), name=action, daemon=True).start()
         else:
             self._answer_action(query)
 
@@ -356,6 +379,7 @@ class Server:
                 _refuse(query, "internal", "the server failed at it; its log says why")
             else:
                 query.reply(query.key_expr, wire.pack(reply), encoding=wire.ENCODING)
+                self.publish_status()  # so that no terms are unheard of, however soon they change again
 
     def _carry_out(self, client: str, action: str, request: dict[str, Any]) -> dict[str, Any]:
         if not wire.is_name(client):
@@ -372,6 +396,8 @@ class Server:
             return self._reset(client)
         if action == "load":
             return self._load(client, request)
+        if action == "record":
+            return self._record(request)
         known = ", ".join(wire.ACTIONS)
         raise Refused("unknown_action", f"no control action is called {action!r}: there are {known}")
 
@@ -562,6 +588,36 @@ class Server:
             )
         return model
 
+    def _record(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Start or end a recording, whoever asks; it belongs to no client."""
+        if self._recordings is None:
+            raise Refused("no_recordings", "the server was started without a folder for recordings")
+        if "file" not in request:
+            raise wire.MalformedMessage("missing_field", "file is missing: expected a name, or null")
+        if not self._recording.acquire(blocking=False):
+            raise Refused("busy", "a recording is being started or ended")
+        try:
+            if request["file"] is None:
+                return self._end_recording()
+            path = file_in(self._recordings, request["file"])
+            if self._state != "running":
+                raise Refused("stopping", "the server is stopping")
+            if self._recorder is not None and self._recorder.error is None:
+                raise Refused("busy", f"{self._recorder.file} is being recorded")
+            self._recorder = Recorder(path, self.keys, self._describe(), self.memory)
+            return {"file": path.name}
+        finally:
+            self._recording.release()
+
+    def _end_recording(self) -> dict[str, Any]:
+        recorder = self._recorder
+        if recorder is None:
+            raise Refused("not_recording", "there is no recording to end")
+        self.publish_status()  # what is recorded can be repeated as far as a status tells of it
+        self._recorder = None
+        recorder.stop()
+        return recorder.report()
+
     def _release(self, client: str) -> tuple[str, ...]:
         released = self.leases.release(client)
         for name in released:
@@ -685,9 +741,12 @@ def serve(
     black_box: Path | None = None,
     surface_hz: float = USUAL_SURFACE_HZ,
     cpu: int | None = None,
+    recordings: Path | None = None,
 ) -> None:
-    """Serve until `stop` is set. Clients may load from the folder `models`; black box files go to `black_box`, or nowhere."""
-    server = Server(model, limits, session, keys, models, black_box, surface_hz, cpu)
+    """Serve until `stop` is set. Clients may load from the folder `models`, and record to the folder `recordings`, if any;
+    black box files go to `black_box`, or nowhere.
+    """
+    server = Server(model, limits, session, keys, models, black_box, surface_hz, cpu, recordings)
     server.start()
     try:
         on_ready()

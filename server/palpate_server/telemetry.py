@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.model import ReducedModel
 from palpate_server import loop
 from palpate_server.leases import Leases
 from palpate_server.safety import Flags
@@ -80,12 +81,14 @@ def success_rate(memory: loop.Memory, contact: int) -> float | None:
 def status(
     state: str,
     server_time_ns: int,
+    model: ReducedModel,
     memory: loop.Memory,
     messages: MessageCounters,
     leases: Leases,
     undisturbed_since_tick: int,
+    recording: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """The status message; `state` is "running" or "stopping"."""
+    """The status message; `state` is "running" or "stopping", `recording` what its recorder reports."""
     ticks = memory.counters.tolist()
     durations = {
         "timer_lateness_s": loop.TIMER_LATENESS,
@@ -96,6 +99,7 @@ def status(
     return {
         "state": state,
         "server_time_ns": server_time_ns,
+        "model": {"name": model.name, "order": model.order, "config_sha256": model.config_sha256},
         "undisturbed_since_tick": undisturbed_since_tick,
         "at_rest_since_tick": ticks[loop.AT_REST_SINCE],
         "ticks": ticks[loop.TICKS],
@@ -112,6 +116,7 @@ def status(
         "refused": dict(messages.refused),
         "malformed": dict(messages.malformed),
         "dropped": dropped(memory, messages),
+        "recording": recording,
         "contacts": {
             name: {
                 "holder": holder,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from palpate_server.compiled import compiled
 
 SCHEMA_VERSION = 1
-ACTIONS = ("acquire", "release", "limits", "reset", "load")  # of control queries
+ACTIONS = ("acquire", "release", "limits", "reset", "load", "record")  # of control queries
 ENCODING = "application/msgpack;palpate.v1"
 MAX_COMMAND_BYTES = 4096
 MAX_REQUEST_BYTES = 16384

@@ -1,7 +1,8 @@
-"""Recordings: complete after a signal, readable after a full disk, and repeatable bit for bit."""
+"""Recordings, a client's and the server's own: complete after a signal, readable after a full disk, repeatable bit for bit."""
 
 from __future__ import annotations
 
+import math
 import resource
 import signal
 import subprocess
@@ -12,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from palpate.model import load_model
+from palpate.model import ReducedModel, load_model
 from palpate_server import replay
 
 
@@ -77,22 +79,17 @@ def test_a_recording_is_complete_after_sigterm_and_repeats_bit_for_bit(
 
         session = replay.read_session(out)
         model = load_model(tmp_path / "model1.npz")
-        result = replay.compare(session, model)
-        assert result.difference is None
-        if any(message["force_scale"][0] > 0 for message in session.forces[: max(0, result.ticks - 100)]):
+        assert replay.compare(session, model).difference is None
+        victim = next(message for message in session.forces if message["force_scale"][0] > 0)
+        x, y, z = victim["force_n"][0]
+        victim["force_n"] = [[x, y, z + 1e-12]]
+        difference = replay.compare(session, model).difference
+        if difference is not None:
             break
         served.stop()
     else:
-        raise AssertionError("forces were lost before the first movement in every one of 5 recordings")
-
-    changed = [dict(message) for message in session.forces]
-    victim = next(i for i, m in enumerate(changed) if m["force_scale"][0] > 0)
-    force = changed[victim]["force_n"][0]
-    changed[victim]["force_n"] = [[force[0], force[1], force[2] + 1e-12]]
-    session.forces = changed
-    difference = replay.compare(session, model).difference
-    assert difference is not None
-    assert f"tick {changed[victim]['tick']}: force_n" in difference
+        raise AssertionError("forces were lost just before the first movement in every one of 5 recordings")
+    assert f"tick {victim['tick']}: force_n" in difference
 
 
 def test_a_full_disk_ends_the_recording_not_the_server_and_what_was_written_is_readable(
@@ -113,6 +110,19 @@ def test_a_full_disk_ends_the_recording_not_the_server_and_what_was_written_is_r
         assert client.next_status()["ticks"] > ticks
 
 
+def test_a_device_that_is_full_ends_the_recording_with_one_line(
+    serve: Callable[..., Any], connect: Callable[..., Any], start_recorder: Callable[..., Any]
+) -> None:
+    served = serve()
+    recorder = start_recorder(Path("/dev/full"), served.endpoint)
+    _, err = recorder.communicate(timeout=60)
+    assert recorder.returncode == 1
+    assert err.splitlines() == ["palpate record: /dev/full: No space left on device; it ends here"]
+    with connect(served.endpoint) as client:
+        ticks = client.statuses[-1]["ticks"]
+        assert client.next_status()["ticks"] > ticks
+
+
 def test_what_is_no_recording_or_not_of_this_model_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "no.mcap"
     path.write_bytes(b"nothing of the kind")
@@ -120,3 +130,160 @@ def test_what_is_no_recording_or_not_of_this_model_is_refused(tmp_path: Path) ->
         replay.read_session(path)
     with pytest.raises(replay.ReplayError, match=r"missing\.mcap"):
         replay.read_session(tmp_path / "missing.mcap")
+
+
+# Recordings that the server makes of itself
+
+
+def wait_for(condition: Callable[[], object], what: str, seconds: float = 20.0) -> None:
+    give_up = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < give_up, f"waited {seconds} s for {what}"
+        time.sleep(0.005)
+
+
+def has_summary(path: Path) -> bool:
+    """True when the file has its end: what viewers seek by."""
+    try:
+        with path.open("rb") as stream:
+            return make_reader(stream).get_summary() is not None
+    except McapError:
+        return False
+
+
+def assert_all_is_repeated(session: replay.Session, model: ReducedModel) -> None:
+    ticks = [message["tick"] for message in session.forces]
+    assert ticks == list(range(ticks[0], ticks[-1] + 1))
+    told = sum(tick < session.statuses[-1]["ticks"] for tick in ticks)
+    assert told > len(ticks) - 200
+    assert replay.compare(session, model) == replay.Comparison(told, 1, None, 0)
+
+
+def test_a_recording_that_a_client_asks_for_has_every_tick_and_command_and_repeats_bit_for_bit(
+    serve: Callable[..., Any], connect: Callable[..., Any], run_example: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serve("--recordings", str(tmp_path / "new"))
+    with connect(served.endpoint) as client:
+        granted, answer = client.control("record", {"file": "a.mcap"})
+        assert granted, answer
+        assert answer == {"file": "a.mcap"}
+        assert client.control("record", {"file": "b.mcap"})[1]["reason"] == "busy"
+        poking = run_example("headless_client.py", served.endpoint, "--duration-s", "2")
+        _, err = poking.communicate(timeout=60)
+        assert poking.returncode == 0, err
+        running = client.next_status()["recording"]
+        assert running["file"] == "a.mcap"
+        granted, report = client.control("record", {"file": None})
+        assert granted, report
+        assert report["messages"] > running["messages"] > 2000
+        assert (report["missing_ticks"], report["error"]) == (0, None)
+        assert client.next_status()["recording"] is None
+
+        path = tmp_path / "new" / "a.mcap"
+        assert has_summary(path)
+        session = replay.read_session(path)
+        assert max(message["force_scale"][0] for message in session.forces) == 1.0
+        assert_all_is_repeated(session, served.model)
+
+        assert client.control("record", {"file": "a.mcap"})[1]["reason"] == "exists"
+        assert client.control("record", {"file": "../b.mcap"})[1]["reason"] == "bad_file"
+        assert client.control("record", {"file": 1})[1]["reason"] == "bad_file"
+        assert client.control("record", {})[1]["reason"] == "missing_field"
+        assert client.control("record", {"file": None})[1]["reason"] == "not_recording"
+    assert [file.name for file in (tmp_path / "new").iterdir()] == ["a.mcap"]
+    assert not (tmp_path / "b.mcap").exists()
+
+
+def test_without_a_folder_for_recordings_nothing_is_recorded(
+    serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serve()
+    with connect(served.endpoint) as client:
+        for file in ("a.mcap", None):
+            granted, refusal = client.control("record", {"file": file})
+            assert not granted
+            assert refusal["reason"] == "no_recordings"
+    assert not list(tmp_path.rglob("*.mcap"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_server_that_ends_while_it_records_leaves_a_complete_file(
+    serve: Callable[..., Any],
+    connect: Callable[..., Any],
+    run_example: Callable[..., Any],
+    tmp_path: Path,
+    number: signal.Signals,
+) -> None:
+    served = serve("--recordings", str(tmp_path))
+    path = tmp_path / "a.mcap"
+    with connect(served.endpoint) as client:
+        assert client.control("record", {"file": "a.mcap"})[0]
+        run_example("headless_client.py", served.endpoint, "--duration-s", "60")
+        wait_for(lambda: client.forces[-1]["force_scale"][0] == 1.0, "the force")
+        wait_for(lambda: client.statuses[-1]["recording"]["messages"] > 2000, "messages")
+        code = served.stop(number)
+    if number == signal.SIGTERM:
+        assert code == 0
+        assert has_summary(path)
+    else:  # the process that writes finds the end of its pipe
+        wait_for(lambda: has_summary(path), "the end of the file")
+    session = replay.read_session(path)
+    assert session.statuses[-1]["state"] == ("stopping" if number == signal.SIGTERM else "running")
+    assert_all_is_repeated(session, served.model)
+
+
+def test_a_full_disk_ends_a_recording_that_a_client_asked_for_not_the_server(
+    serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serve("--recordings", str(tmp_path))
+    with connect(served.endpoint) as client:
+        before = resource.prlimit(served.process.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(served.process.pid, resource.RLIMIT_FSIZE, (100_000, before[1]))
+        assert client.control("record", {"file": "full.mcap"})[0]
+        resource.prlimit(served.process.pid, resource.RLIMIT_FSIZE, before)
+        wait_for(lambda: client.statuses[-1]["recording"]["error"], "the end of the recording")
+        assert client.statuses[-1]["recording"]["error"] == "File too large"
+        assert len(replay.read_session(tmp_path / "full.mcap").forces) > 100
+
+        # A failed one is in nobody's way, and can be ended as well as replaced.
+        assert client.control("record", {"file": "next.mcap"})[0]
+        client.next_status()
+        granted, report = client.control("record", {"file": None})
+        assert granted
+        assert report["error"] is None
+    assert has_summary(tmp_path / "next.mcap")
+
+
+def test_a_recording_that_begins_while_the_tissue_moves_is_repeated_from_rest_or_refused(
+    serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    served = serve("--recordings", str(tmp_path))
+    moving, rested = tmp_path / "moving.mcap", tmp_path / "rested.mcap"
+
+    def poke(client: Any, ticks: int) -> None:
+        for i in range(ticks):
+            client.command({"tip": [0.0, 0.0, 1e-3 * math.sin(0.02 * i)]})
+            time.sleep(1e-3)
+
+    with connect(served.endpoint) as client:
+        assert client.acquire("tip")[0]
+        poke(client, 500)
+        assert client.control("record", {"file": moving.name})[0]
+        poke(client, 500)
+        assert client.control("record", {"file": None})[0]
+        assert client.control("record", {"file": rested.name})[0]
+        poke(client, 200)
+        wait_for(lambda: client.statuses[-1]["at_rest_since_tick"] >= 0, "rest", seconds=60.0)
+        rest = client.next_status()["at_rest_since_tick"]
+        poke(client, 500)
+        assert client.control("record", {"file": None})[0]
+
+    model = str(tmp_path / "model1.npz")
+    assert replay.main([str(moving), model]) == 2
+    assert "was never at rest in this recording" in capsys.readouterr().err
+    session = replay.read_session(rested)
+    assert session.forces[0]["tick"] < rest - 500
+    session.forces = [message for message in session.forces if message["tick"] >= rest]
+    assert_all_is_repeated(session, served.model)
+    assert replay.main([str(rested), model]) == 0
+    assert "every force is the same, bit for bit" in capsys.readouterr().out
