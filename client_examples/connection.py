@@ -28,18 +28,20 @@ class Refused(Exception):
 class Connection:
     """One client in one session. Use it in a `with` statement: Zenoh must be closed, or the program hangs at exit."""
 
-    def __init__(self, endpoint="tcp/127.0.0.1:7447", session="main", zenoh_config=None):
+    def __init__(self, endpoint="tcp/127.0.0.1:7447", session="main", zenoh_config=None, name=None):
         self.prefix = f"palpate/{session}"
-        self.endpoint = endpoint
-        # The name is part of the keys that only we use; it has to be unlike every other client's.
-        self.name = f"client-{uuid.uuid4().hex[:12]}"
+        self.place = zenoh_config or endpoint
+        # The name is part of every key that we write to. It has to be unlike every other client's, and under access
+        # control it is the name in our certificate.
+        self.name = name or f"client-{uuid.uuid4().hex[:12]}"
+        self.there = threading.Event()
         self.gone = threading.Event()
         self.sequence = 0
         try:
             self.zenoh = zenoh.open(_configuration(endpoint, zenoh_config))
         except zenoh.ZError as error:
             cause = str(error).partition(" at /")[0]  # what follows is a place in Zenoh's own source
-            raise ServerGone(f"nothing answers at {zenoh_config or endpoint}: {cause}") from error
+            raise ServerGone(f"nothing answers at {self.place}: {cause}") from error
         try:
             self._join()
         except BaseException:
@@ -50,8 +52,10 @@ class Connection:
         # The token is our sign of life: when it goes, because we are killed or cut off, the server takes our contacts
         # back and lets their force fade.
         self._token = self.zenoh.liveliness().declare_token(f"{self.prefix}/client/{self.name}")
-        # The server has one too. It tells us that the server is gone faster than any timeout could.
-        self._watch = self.zenoh.liveliness().declare_subscriber(f"{self.prefix}/server", self._on_server)
+        # The server has one too: it tells us when there is a server, and that it is gone faster than any timeout could.
+        self._watch = self.zenoh.liveliness().declare_subscriber(
+            f"{self.prefix}/server", self._on_server, history=True
+        )
         # Forces and commands are worth nothing when late: no batching, and drop instead of wait.
         self._commands = self.zenoh.declare_publisher(
             f"{self.prefix}/command/{self.name}",
@@ -71,11 +75,15 @@ class Connection:
         self.zenoh.close()
 
     def _on_server(self, sample):
-        if sample.kind == zenoh.SampleKind.DELETE:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self.there.set()
+        else:
             self.gone.set()
 
     def _wait_for_description(self):
-        # Right after connecting, the other side's queryables may not be known here yet: ask again for a while.
+        if not self.there.wait(QUERY_TIMEOUT_S):
+            raise ServerGone(f"no server for {self.prefix} at {self.place}")
+        # On the way through a router the token may be faster than what makes queries arrive: ask again for a while.
         give_up = time.monotonic() + QUERY_TIMEOUT_S
         while True:
             try:
@@ -95,7 +103,7 @@ class Connection:
                 break  # not the server's words but Zenoh's: the time is over
             refusal = msgpack.unpackb(reply.err.payload.to_bytes())
             raise Refused(f"{refusal['message']} ({refusal['reason']})")
-        raise ServerGone(f"no server answers for {self.prefix}/{key} at {self.endpoint}")
+        raise ServerGone(f"no server at {self.place} answers {self.prefix}/{key}, or it does not let us ask")
 
     def acquire(self, contacts, **wishes):
         """Take contacts for ourselves alone; only then are our commands for them heard.

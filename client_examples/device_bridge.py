@@ -42,7 +42,7 @@ def main():
     options = parse_options()
     zenoh.try_init_log_from_env()  # silent unless RUST_LOG says otherwise
     try:
-        with Connection(options.connect, options.session, options.zenoh_config) as connection:
+        with Connection(options.connect, options.session, options.zenoh_config, options.name) as connection:
             return run(connection, options)
     except (Refused, ServerGone) as error:
         print(f"device bridge: {error}", file=sys.stderr)
@@ -137,6 +137,9 @@ def parse_options():
     parser.add_argument("--session", default="main", help="the server's --session (%(default)s)")
     parser.add_argument(
         "--zenoh-config", metavar="FILE", help="Zenoh configuration to use instead of --connect"
+    )
+    parser.add_argument(
+        "--name", help="this client's; under access control, that in its certificate (default: a random one)"
     )
     parser.add_argument("--device", default="generic", help="profile whose limits are to hold (%(default)s)")
     parser.add_argument("--mass-kg", type=positive, default=0.1, help="of the handle (%(default)s)")

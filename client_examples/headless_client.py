@@ -22,7 +22,7 @@ def main():
     options = parse_options()
     zenoh.try_init_log_from_env()  # silent unless RUST_LOG says otherwise
     try:
-        with Connection(options.connect, options.session, options.zenoh_config) as connection:
+        with Connection(options.connect, options.session, options.zenoh_config, options.name) as connection:
             return run(connection, options)
     except (Refused, ServerGone, OSError) as error:
         print(f"palpate client: {error}", file=sys.stderr)
@@ -171,6 +171,9 @@ def parse_options():
     parser.add_argument("--session", default="main", help="the server's --session (%(default)s)")
     parser.add_argument(
         "--zenoh-config", metavar="FILE", help="Zenoh configuration to use instead of --connect"
+    )
+    parser.add_argument(
+        "--name", help="this client's; under access control, that in its certificate (default: a random one)"
     )
     parser.add_argument("--contact", help="name of the contact to move (default: the model's first)")
     parser.add_argument(

@@ -1,18 +1,23 @@
 #!/bin/sh
-# A certificate authority of one's own, and certificates from it: for the server, and for the two kinds of client that
+# A certificate authority of one's own, and certificates from it: for the server, and for the two clients that
 # server.json5 knows by name, `operator` (moves tools) and `observer` (listens only).
 #
-#   sh make_certificates.sh [FOLDER]          (default: certificates)
+#   sh make_certificates.sh [FOLDER [NAME...]]          (default: certificates server operator observer)
 #
+# An authority that is already there is kept, so that a certificate can be added later.
 # Keep authority.key away from the machines that run clients: who has it can make operators.
 set -eu
 folder=${1:-certificates}
+if [ $# -gt 0 ]; then shift; fi
+if [ $# -eq 0 ]; then set -- server operator observer; fi
 mkdir -p "$folder"
 cd "$folder"
 umask 077
-openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 3650 \
-    -subj "/CN=palpate authority" -keyout authority.key -out authority.pem 2>/dev/null
-for name in server operator observer; do
+if [ ! -e authority.key ]; then
+    openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 3650 \
+        -subj "/CN=palpate authority" -keyout authority.key -out authority.pem 2>/dev/null
+fi
+for name in "$@"; do
     openssl req -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes \
         -subj "/CN=$name" -keyout "$name.key" -out "$name.csr" 2>/dev/null
     printf 'subjectAltName=DNS:localhost,IP:127.0.0.1\nbasicConstraints=CA:FALSE\nextendedKeyUsage=serverAuth,clientAuth\n' > "$name.ext"

@@ -11,6 +11,9 @@ import zenoh
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LEASE_MS = 1000  # after which a peer that does not answer counts as gone
+# The largest message that a server puts together from fragments; its clients have nothing to say that takes a quarter
+# of it. Zenoh drops a larger one and keeps the link; of itself it would collect up to 1 GiB for each client and priority.
+MAX_MESSAGE_BYTES = 65536
 
 _QUIET: dict[str, Any] = {
     "mode": "peer",
@@ -32,6 +35,9 @@ def open_session(listen: str | None, config_file: Path | None) -> zenoh.Session:
     endpoint = listen or DEFAULT_ENDPOINT
     settings = {
         "listen/endpoints": [endpoint],
+        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+        # A client's shared memory would become part of ours, past that bound: as much of it as the client likes.
+        "transport/shared_memory/enabled": False,
         # Forces are sent unbatched: room for 16 of them while the sender's thread is held up, then drop at once.
         "transport/link/tx/queue/size/real_time": 16,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
