@@ -192,6 +192,7 @@ def assert_powerless(client: Client) -> None:
         ("limits", {"limits": {"max_force_n": 1.0}}),
         ("reset", {}),
         ("load", {"model": "model.npz"}),
+        ("record", {}),
     ):
         assert client.control(action, request) == ""
     for _ in range(100):
