@@ -52,10 +52,8 @@ def update(
 
     diagonal, cross, state (order,), order even; b_transposed (n_inputs, order); displacement (n_inputs,) m
     """
-    for pair in range(
-        state.shape[0] // 2
-    ):  # with range(0, order, 2) the compiler would test every index for its sign
-        i = 2 * pair
+    for pair in range(state.shape[0] // 2):
+        i = 2 * pair  # with range(0, order, 2) the compiler would test every index for its sign
         first, second = state[i], state[i + 1]
         state[i] = diagonal[i] * first + cross[i] * second
         state[i + 1] = cross[i + 1] * first + diagonal[i + 1] * second

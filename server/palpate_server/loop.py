@@ -92,6 +92,8 @@ _DECAYING = int(Flags.DECAYING)
 _STALE = int(Flags.STALE)
 _SOFT_START = int(Flags.SOFT_START)
 _FAULT = int(Flags.FAULT)
+_SPEED_LIMITED = int(Flags.SPEED_LIMITED)
+_JUMPED = int(Flags.JUMPED)
 _LATE = int(Flags.LATE)
 _CAUGHT_UP = int(Flags.CAUGHT_UP)
 
@@ -582,11 +584,16 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
             m.origin[i],
             m.limits[i, WORKSPACE] / max(1.0, m.frame_scale[i]),  # at the device and in the model
             m.limits[i, MAX_SPEED] * period_s,
+            m.limits[i, MAX_SPEED] * safety.HOLD_NS * 1e-9,
         )
+        if not live:
+            flags &= ~_JUMPED  # that is our own withdrawal
+        elif flags & _SPEED_LIMITED and m.record_inputs[(tick - 1) % RECORDS, i, CONTACT_FLAGS] & _JUMPED:
+            flags |= _JUMPED  # still on its way
         for j in range(3):
             m.step[i, j] = m.applied[i, j] - m.step[i, j]
         frames.to_model(m.rotation[i], m.frame_scale[i], m.origin[i], m.applied[i], m.displacement[i])
-        scale = safety.fade(m.scale[i], live, period)
+        scale = safety.fade(m.scale[i], live and not flags & _JUMPED, period)
         if live:
             if scale < 1.0:
                 flags |= _SOFT_START

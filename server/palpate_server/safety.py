@@ -1,7 +1,7 @@
 """What stands between a client's numbers and the model, and between the model and a hand: pure compiled functions.
 
 Each tick and contact, in this order: reconstruction of the input between commands; its workspace and speed; its
-staleness, which scales the force; passivity at the device's port; slew rate of the force; its magnitude. (That numbers
+staleness and its jumps, which scale the force; passivity at the device's port; slew rate of the force; its magnitude. (That numbers
 are finite is checked before they come here.) Everything is in the frame of the client that holds the contact.
 """
 
@@ -39,6 +39,7 @@ class Flags(IntFlag):
     LATE = 512  # the tick began more than a quarter of a period after its deadline
     CAUGHT_UP = 1024  # the tick was missed and made up for, together with a later one
     PASSIVITY_LIMITED = 2048  # the port had given out energy; the force is damped to take it back
+    JUMPED = 4096  # farther than a tip can move while input is held: the force fades while it goes there, then in again
 
 
 class Limits(NamedTuple):
@@ -62,6 +63,7 @@ _SPEED_LIMITED = int(Flags.SPEED_LIMITED)
 _SLEW_LIMITED = int(Flags.SLEW_LIMITED)
 _FORCE_CLAMPED = int(Flags.FORCE_CLAMPED)
 _PASSIVITY_LIMITED = int(Flags.PASSIVITY_LIMITED)
+_JUMPED = int(Flags.JUMPED)
 
 
 @compiled
@@ -81,10 +83,12 @@ def is_finite(value: float) -> bool:
 
 
 @compiled
-def follow(target: Floats, applied: Floats, origin: Floats, workspace_radius: float, max_step: float) -> int:
+def follow(
+    target: Floats, applied: Floats, origin: Floats, workspace_radius: float, max_step: float, jump: float
+) -> int:
     """Move `applied` (3,) towards `target` (3,), no further than `max_step` and not out of the workspace; flags.
 
-    The workspace is a ball around `origin` (3,). `applied` is changed in place; it stays where it is when `target` has no finite length. All in m.
+    A way of more than `jump` is flagged as one. The workspace is a ball around `origin` (3,). `applied` is changed in place; it stays where it is when `target` has no finite length. All in m.
     """
     flags = 0
     x, y, z = target[0] - origin[0], target[1] - origin[1], target[2] - origin[2]
@@ -103,6 +107,8 @@ def follow(target: Floats, applied: Floats, origin: Floats, workspace_radius: fl
         applied[0] += dx * share
         applied[1] += dy * share
         applied[2] += dz * share
+        if distance > jump:
+            flags |= _JUMPED
         return flags | _SPEED_LIMITED
     applied[0], applied[1], applied[2] = wanted_x, wanted_y, wanted_z
     return flags

@@ -138,12 +138,40 @@ def test_a_jump_is_followed_at_the_speed_limit(make_spring_mass_model: Callable[
     memory = loop.make_memory(model.discrete, model.period_s, [FREE._replace(max_speed_m_per_s=0.5)], 1 / 30)
     depths = []
     for i in range(40):
-        command(memory, i, (0.0, 0.0, 0.01))
+        command(memory, i, (0.0, 0.0, 0.009))
         flags, applied, *_ = tick(memory)
         depths.append(applied[2])
-        assert bool(flags & Flags.SPEED_LIMITED) == (applied[2] < 0.01)
-    np.testing.assert_allclose(np.diff(depths[:19]), 0.5e-3)
-    assert depths[-1] == 0.01
+        assert bool(flags & Flags.SPEED_LIMITED) == (applied[2] < 0.009)
+        assert not flags & Flags.JUMPED  # it may have been on its way while the input was held
+    np.testing.assert_allclose(np.diff(depths[:17]), 0.5e-3)
+    assert depths[-1] == 0.009
+
+
+def test_a_jump_that_no_hold_explains_fades_the_force_until_the_tip_is_there_then_softly_in(
+    spring: loop.Memory,
+) -> None:
+    for i in range(300):
+        command(spring, i, (0.0, 0.0, 1e-3))
+        flags, _, force, scale = tick(spring)
+    assert scale == 1
+    assert not flags & Flags.JUMPED
+    scales, forces = [scale], [force]
+    for i in range(300, 600):
+        command(spring, i, (0.06, 0.0, 1e-3))  # 60 mm at 1 m/s: 60 ticks
+        flags, applied, force, scale = tick(spring)
+        assert bool(flags & Flags.JUMPED) == (applied[0] < 0.06)
+        scales.append(scale)
+        forces.append(force)
+    fading, there, back = scales[:51], scales[50:60], scales[60:]
+    np.testing.assert_allclose(fading, np.linspace(1, 0, 51), atol=1e-12)
+    np.testing.assert_array_equal(there, 0)
+    np.testing.assert_allclose(np.diff(back[:200]), 1 / 200)
+    steps = np.linalg.norm(np.diff(forces, axis=0), axis=1)
+    assert steps.max() <= USUAL.max_force_rate_n_per_s * 1e-3 * (1 + 1e-12)
+    loop.forget_command(spring.commands, 0)
+    for _ in range(200):  # withdrawn from as far, which is no jump of a client's
+        flags, *_ = tick(spring)
+        assert not flags & Flags.JUMPED
 
 
 def test_a_model_that_gives_nan_is_put_to_rest_and_counted(memory: loop.Memory) -> None:

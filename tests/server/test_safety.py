@@ -32,7 +32,7 @@ def test_the_tip_moves_no_further_than_a_step_and_ends_inside_the_workspace(
         applied = applied * (radius / size)
     applied += origin
     before = applied.copy()
-    flags = safety.follow(target, applied, origin, radius, max_step)
+    flags = safety.follow(target, applied, origin, radius, max_step, 20 * max_step)
     rounding = ROUNDING * (radius + np.abs(origin).max())
     assert np.linalg.norm(applied - before) <= max_step * (1 + ROUNDING) + rounding
     assert np.linalg.norm(applied - origin) <= radius + rounding
@@ -40,6 +40,12 @@ def test_the_tip_moves_no_further_than_a_step_and_ends_inside_the_workspace(
     assert bool(flags & Flags.WORKSPACE_CLAMPED) == (math.sqrt(x * x + y * y + z * z) > radius)
     if not flags:
         np.testing.assert_array_equal(applied, target)
+    way = np.linalg.norm(applied - before)
+    left = np.linalg.norm((target if not flags & Flags.WORKSPACE_CLAMPED else applied) - applied)
+    if flags & Flags.JUMPED:
+        assert flags & Flags.SPEED_LIMITED
+    elif not flags & Flags.WORKSPACE_CLAMPED:
+        assert way + left <= 20 * max_step * (1 + ROUNDING) + rounding
 
 
 @settings(deadline=None)
