@@ -2,8 +2,9 @@
 
     python -m palpate_server.record OUT.mcap [--connect ENDPOINT] [--session NAME] [--duration-s S]
 
-A process of its own: a slow disk can't disturb the loop. Start it before the first command if the recording is to be
-replayed. SIGINT or SIGTERM ends it and leaves a complete file; after a full disk (exit code 1) what was written until then
+A process of its own: a slow disk can't disturb the loop. What follows a rest can be replayed: start it before the first
+command. Forces and commands are best effort, so that some may be missing; a recording that the server makes of itself
+(`palpate serve --recordings FOLDER`) has them all. SIGINT or SIGTERM ends it and leaves a complete file; after a full disk (exit code 1) what was written until then
 can still be read.
 """
 

@@ -30,6 +30,7 @@ from palpate_server.image import Image, make_image
 from palpate_server.safety import Flags, Limits
 
 _OF_THE_TICK = int(Flags.LATE | Flags.CAUGHT_UP)  # depend on the machine, not on the model
+_NEEDED = {"ticks", "at_rest_since_tick", "undisturbed_since_tick", "model", "contacts"}  # of a status
 _LIMITED = int(Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED)
 Agreed = TypeVar("Agreed", Limits, Frame)
 
@@ -76,6 +77,10 @@ def read_session(path: Path) -> Session:
                 elif kind == "palpate.force":
                     session.forces.append(message)
                 elif kind == "palpate.status":
+                    if missing := _NEEDED - message.keys():
+                        raise ReplayError(
+                            f"{path}: a status has no {', '.join(sorted(missing))}: recorded from another version?"
+                        )
                     session.statuses.append(message)
                 elif kind == "palpate.command":
                     _add_command(session, message)

@@ -454,10 +454,11 @@ class Server:
 
     def _set_terms(self, name: str, limits: Limits, frame: Frame, device: Device | None) -> None:
         contact = self._contact_index[name]
-        self._between_ticks(loop.set_limits, contact, np.array(limits))
         rotation, origin = np.array(frame.rotation), np.array(frame.origin_m)
-        tick = self._between_ticks(loop.set_frame, contact, rotation, frame.scale, origin)
-        self.leases.terms[name] = Terms(limits, frame, device, tick, tick)
+        held_since = self._between_ticks(loop.set_frame, contact, rotation, frame.scale, origin)
+        # The tip is at rest now, where it does not matter that the limits come a tick later.
+        since = self._between_ticks(loop.set_limits, contact, np.array(limits))
+        self.leases.terms[name] = Terms(limits, frame, device, since, held_since)
 
     def _between_ticks(self, ask: Callable[..., None], *what: Any) -> int:
         """Have the loop change something; the first tick after it. Raises Refused when no tick comes."""

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import pytest
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from palpate.model import ReducedModel, load_model
+from palpate.model import ReducedModel, load_model, save_model
 from palpate_server import replay
 
 
@@ -192,6 +192,63 @@ def test_a_recording_that_a_client_asks_for_has_every_tick_and_command_and_repea
         assert client.control("record", {"file": None})[1]["reason"] == "not_recording"
     assert [file.name for file in (tmp_path / "new").iterdir()] == ["a.mcap"]
     assert not (tmp_path / "b.mcap").exists()
+
+
+def test_whatever_a_client_has_changed_meanwhile_is_repeated_too(
+    serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serve("--recordings", str(tmp_path))
+    frame = {"rotation": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], "scale": 0.5, "origin_m": [0.1, 0.2, 0.3]}
+
+    def poke(client: Any, ticks: int, origin: Sequence[float]) -> None:
+        for i in range(ticks):
+            client.command({"tip": [origin[0] + 1e-3 * math.sin(0.5 * i), origin[1], origin[2] - 2e-3]})
+            time.sleep(1e-3)
+
+    with connect(served.endpoint) as client:
+        client.next_status()
+        assert client.control("record", {"file": "a.mcap"})[0]
+        assert client.acquire("tip")[0]
+        poke(client, 300, (0, 0, 0))
+        for speed in (0.05, 0.02, 0.01, 0.1, 0.03):  # sooner after one another than two usual statuses
+            assert client.control("limits", {"limits": {"max_speed_m_per_s": speed}})[0]
+            poke(client, 10, (0, 0, 0))
+        # Taken over in another frame and for a device while the tip is still on its way back.
+        assert client.control("acquire", {"contacts": ["tip"], "frame": frame, "device": "touch"})[0]
+        poke(client, 300, frame["origin_m"])
+        assert client.control("record", {"file": None})[0]
+    session = replay.read_session(tmp_path / "a.mcap")
+    assert len({status["contacts"]["tip"]["since_tick"] for status in session.statuses}) >= 7
+    assert_all_is_repeated(session, served.model)
+
+
+def test_a_change_of_model_ends_what_can_be_repeated_with_either_until_the_next_rest(
+    serve: Callable[..., Any],
+    connect: Callable[..., Any],
+    make_spring_mass_model: Callable[..., ReducedModel],
+    tmp_path: Path,
+) -> None:
+    served = serve("--recordings", str(tmp_path))
+    other = make_spring_mass_model(1, 22)
+    save_model(other, tmp_path / "other.npz")
+    with connect(served.endpoint) as client:
+        client.next_status()
+        assert client.control("record", {"file": "a.mcap"})[0]
+        assert client.acquire("tip")[0]
+        client.command({"tip": [0.0, 0.0, -1e-3]})
+        client.next_status()
+        assert client.control("load", {"model": "other.npz"})[0]
+        wait_for(lambda: client.statuses[-1]["at_rest_since_tick"] >= 0, "rest", seconds=60.0)
+        rest = client.next_status()["at_rest_since_tick"]
+        client.command({"tip": [0.0, 0.0, -1e-3]})
+        client.next_status()
+        assert client.control("record", {"file": None})[0]
+    session = replay.read_session(tmp_path / "a.mcap")
+    first, changed = session.forces[0]["tick"], session.statuses[-1]["undisturbed_since_tick"]
+    assert replay.compare(session, served.model) == replay.Comparison(changed - first, 1, None, 0)
+    told = session.statuses[-1]["ticks"]
+    assert session.statuses[-1]["model"]["order"] == other.order
+    assert replay.compare(session, other) == replay.Comparison(told - rest, 1, None, 0)
 
 
 def test_without_a_folder_for_recordings_nothing_is_recorded(
