@@ -30,6 +30,7 @@ _PERIOD_S = 0.05
 _MAX_UNWRITTEN = 16 * 2**20  # bytes: a minute of a contact
 _END_S = 2.0  # to write the rest and end the file
 _PIPE_BYTES = 65536  # that a pipe takes at once
+_TOO_SLOW = "the disk can't keep up"
 _LONGEST_NAME = 255  # bytes, on the usual file systems
 
 
@@ -103,7 +104,7 @@ class Recorder:
             self._put("status", self._keys.status, payload)
 
     def stop(self) -> None:
-        """Write what is left and end the file, in two seconds at most; `messages` and `error` then are the last word."""
+        """Write what is left and end the file, in a few seconds at most; `report` then is the last word."""
         self._ending.set()
         self._thread.join()
 
@@ -124,7 +125,7 @@ class Recorder:
                 self._collect()
                 self._write(_PERIOD_S)
                 if len(self._unwritten) > _MAX_UNWRITTEN:
-                    raise _EndedEarlyError("the disk can't keep up")
+                    raise _EndedEarlyError(_TOO_SLOW)
             self._collect(everything=True)
             self._finish()
         except Exception as error:  # whatever it was: the recording is over, and says so
@@ -186,6 +187,8 @@ class Recorder:
     def _finish(self) -> None:
         give_up = time.monotonic() + _END_S
         self._write(_END_S)
+        if self._unwritten:
+            raise _EndedEarlyError(_TOO_SLOW)
         self._close_pipe()
         try:
             code = self._process.wait(max(0.1, give_up - time.monotonic()))

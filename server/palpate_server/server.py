@@ -45,7 +45,7 @@ class Server:
     """Serves one model in one Zenoh session, from `start` to `stop`.
 
     Threads: Zenoh's own one that receives commands (and runs most ticks), the deadline loop (compiled, never needs
-    the GIL), one that sends the forces of its ticks, one for queries and leases, one for the surface. The thread that
+    the GIL), one that sends the forces of its ticks, one for queries and leases, one for the surface, one for a recording. The thread that
     calls `publish_status` sends the status.
 
     cpu: to keep the threads that run ticks on, or None to leave that to the system. recordings: the folder that clients

@@ -137,12 +137,25 @@ def test_a_process_that_no_longer_takes_anything_ends_the_recording_and_nobody_w
     memory: loop.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder, "_MAX_UNWRITTEN", 100_000)
-    monkeypatch.setattr(sys, "executable", str(_script(tmp_path, "sleep 30")))
+    monkeypatch.setattr(sys, "executable", str(_script(tmp_path, "exec sleep 30")))
     recording = Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)
     give_up = time.monotonic() + 20.0
     while recording.report()["error"] is None and time.monotonic() < give_up:
         run(recording, memory, 100)
         time.sleep(0.01)
+    assert recording.report()["error"] == "the disk can't keep up"
+    recording._process.kill()
+    recording._process.wait()
+
+
+def test_what_is_not_taken_in_time_at_the_end_is_an_error(
+    memory: loop.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "_END_S", 0.3)
+    monkeypatch.setattr(sys, "executable", str(_script(tmp_path, "exec sleep 30")))
+    recording = Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)
+    run(recording, memory, 1000)
+    recording.stop()
     assert recording.report()["error"] == "the disk can't keep up"
     recording._process.kill()
     recording._process.wait()
