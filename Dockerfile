@@ -7,7 +7,7 @@ COPY server server
 COPY client_examples client_examples
 COPY configs configs
 RUN python -m venv /opt/palpate \
-    && /opt/palpate/bin/pip install --no-cache-dir --constraint constraints.txt .
+    && /opt/palpate/bin/pip install --no-cache-dir --constraint constraints.txt ".[recorder,metrics]"
 
 # Stage 2 runs it: no compiler, no sources, not root.
 FROM python:3.11-slim
@@ -19,7 +19,7 @@ ENV PATH=/opt/palpate/bin:$PATH \
     NUMBA_CPU_NAME=generic
 USER 10001
 WORKDIR /models
-# The kernels are compiled here, as the user that will run them: the server then starts in under a second.
+# The kernels are compiled here, as the user that will run them: the server then starts in about a second.
 RUN python -c "from palpate_server.server import warm_up; warm_up(0.001, 1)"
 EXPOSE 7447
 STOPSIGNAL SIGTERM
