@@ -35,7 +35,7 @@ def compiled_exactly(function: Function) -> Function:
 
 
 class _Cache(FunctionCache):
-    """numba's cache on disk, out of date as soon as any file of this package has changed.
+    """numba's cache on disk, out of date as soon as any file of this package with compiled functions has changed.
 
     numba looks at the function's own file alone, though what it stores has the functions of other files in it.
     """
@@ -48,11 +48,13 @@ class _Cache(FunctionCache):
 
 @cache
 def _package_digest() -> str:
-    """The hash of all names and contents of this package's source files."""
+    """The hash of the names and contents of this package's source files that import from this one, and its own."""
     digest = hashlib.sha256()
     folder = Path(__file__).parent
     for path in sorted(folder.rglob("*.py")):
         source = path.read_bytes()
+        if b".compiled import" not in source and path != Path(__file__):
+            continue
         digest.update(f"{path.relative_to(folder)} {len(source)}\n".encode() + source)
     return digest.hexdigest()
 
