@@ -602,7 +602,7 @@ def _run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
         m.scale[i] = scale
         inputs = m.record_inputs[row, i]
         inputs[SEQUENCE] = integers[SEQUENCE]
-        inputs[CLIENT_TIME_NS] = integers[CLIENT_TIME_NS]
+        inputs[CLIENT_TIME_NS] = integers[CLIENT_TIME_NS] if known else -1
         inputs[AGE_NS] = age
         inputs[CONTACT_FLAGS] = flags
 

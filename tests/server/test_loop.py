@@ -53,11 +53,18 @@ def stop_threads() -> Iterator[Callable[[loop.Memory, threading.Thread], None]]:
         assert not thread.is_alive()
 
 
-def test_without_a_command_the_force_is_zero_and_stale(memory: loop.Memory) -> None:
-    flags, _, force, scale = tick(memory)
+def test_without_a_command_the_force_is_zero_and_stale_and_nothing_is_echoed(memory: loop.Memory) -> None:
+    command(memory, 1, (0.0, 0.0, 0.0))
+    tick(memory)
+    for _ in range(2):
+        loop.forget_command(memory.commands, 0)
+        flags, _, force, scale = tick(memory)
     assert flags == Flags.STALE
     assert scale == 0
     np.testing.assert_array_equal(force, 0)
+    np.testing.assert_array_equal(
+        memory.record_inputs[[0, 1, 2], 0, :3], [[1, 7, 0], [-1, -1, -1], [-1, -1, -1]]
+    )
 
 
 def test_forces_are_the_discrete_models_response_to_the_applied_displacements(
