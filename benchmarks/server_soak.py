@@ -25,7 +25,7 @@ import numpy as np
 import psutil
 
 from palpate.model import load_model, save_model
-from palpate_server import loop, transport, wire
+from palpate_server import layout, transport, wire
 from palpate_server.round_trips import free_endpoint
 from palpate_server.safety import Limits
 from palpate_server.sample_model import spring_mass_model
@@ -167,7 +167,7 @@ def draw(histograms: Any, longest_ns: Any, memory: list[tuple[float, float]], pa
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    for row, label in ((loop.TIMER_LATENESS, "deadline timer"), (loop.TICK_LATENESS, "tick")):
+    for row, label in ((layout.TIMER_LATENESS, "deadline timer"), (layout.TICK_LATENESS, "tick")):
         counts = histograms[row]
         edges = np.unique(np.round(np.geomspace(1, len(counts), 60)).astype(int)) - 1
         sums = np.add.reduceat(counts, edges[:-1])

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.model import ReducedModel, load_model
-from palpate_server import loop
+from palpate_server import layout, loop
 from palpate_server.devices import PROFILES
 from palpate_server.image import make_image
 from palpate_server.safety import Limits
@@ -72,7 +72,7 @@ def swing(model: ReducedModel, mass: float, damping: float, delay: int, controll
     inwards = -np.array(contact.normal)
     period = model.period_s
     limits = Limits(1e3, 1e9, 1e3, 1.0, controller)
-    memory = loop.make_memory(model.discrete, period, [limits] * len(model.contacts), 1.0)
+    memory = layout.make_memory(model.discrete, period, [limits] * len(model.contacts), 1.0)
     image = make_image(memory)
     position = velocity = 0.0
     rendered: list[float] = [0.0] * delay  # forces under way to the device, oldest first
@@ -80,7 +80,7 @@ def swing(model: ReducedModel, mass: float, damping: float, delay: int, controll
     ticks = int(SECONDS / period)
     for k in range(ticks):
         now = time.monotonic_ns()
-        memory.shared[loop.DEADLINE_NS] = now + memory.period_ns[0] // 4
+        memory.shared[layout.DEADLINE_NS] = now + memory.period_ns[0] // 4
         depth = max(position, 0.0)  # outside, the tip does not touch
         told = k - delay - 1 if k > delay else -1
         target = tuple(float(v) for v in depth * inwards)

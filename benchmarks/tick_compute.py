@@ -26,7 +26,7 @@ from numba import njit
 from numba.core.runtime import _nrt_python as _nrt
 from numba.core.runtime import rtsys
 
-from palpate_server import kernel, loop, wire
+from palpate_server import kernel, layout, loop, wire
 from palpate_server.image import make_image
 from palpate_server.safety import Limits
 from palpate_server.sample_model import spring_mass_model
@@ -109,7 +109,7 @@ def row(order: int, contacts: int, runs: int) -> None:
     model = spring_mass_model(contacts, order // 2)
     system, channels = model.discrete, 3 * contacts
     inputs = np.random.default_rng(0).normal(size=(64, channels)) * 1e-3
-    blocks = loop.make_model(system)
+    blocks = layout.make_model(system)
     force = np.zeros(channels)
     b, c, d = blocks.b_transposed, blocks.c, blocks.d
     blocks_args = (blocks.diagonal, blocks.cross, b, c, d, blocks.state, inputs, force)
@@ -125,7 +125,7 @@ def row(order: int, contacts: int, runs: int) -> None:
     run_reads(1, matrices)
 
     limits = Limits(10.0, 2000.0, 1.0, 0.1, 4.0)
-    memory = loop.make_memory(system, model.period_s, [limits] * contacts, 1 / 30)
+    memory = layout.make_memory(system, model.period_s, [limits] * contacts, 1 / 30)
     ticks_args = (memory.commands, make_image(memory), time.monotonic_ns(), int(memory.period_ns[0]))
     run_ticks(1, *ticks_args)
     entry, ticks = (allocations(lambda n=n: run_ticks(n, *ticks_args)) for n in (0, STEPS))

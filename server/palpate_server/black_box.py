@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.files import write_whole
-from palpate_server import loop
+from palpate_server import layout, loop
 from palpate_server.safety import Flags
 
 log = logging.getLogger("palpate_server")
@@ -38,7 +38,7 @@ class BlackBox:
     the last second's ticks met a limit). One file of each cause in QUIET_S; the writing is done by a thread of its own.
     """
 
-    def __init__(self, folder: Path, session: str, contacts: Sequence[str], memory: loop.Memory) -> None:
+    def __init__(self, folder: Path, session: str, contacts: Sequence[str], memory: layout.Memory) -> None:
         self.folder = folder
         self.session = session
         self.contacts = list(contacts)
@@ -49,7 +49,7 @@ class BlackBox:
     def examine(self) -> threading.Thread | None:
         """The thread that writes a file, when there was cause for one."""
         head = int(loop.records_written(self.memory.shared))
-        first = max(self._seen, head - loop.RECORDS // 2, 0)
+        first = max(self._seen, head - layout.RECORDS // 2, 0)
         cause = self._cause(first, head)
         self._seen = head
         now = time.monotonic()
@@ -75,14 +75,14 @@ class BlackBox:
             return "limits"
         return None
 
-    def _flags(self, first: int, last: int) -> loop.Integers:
+    def _flags(self, first: int, last: int) -> layout.Integers:
         """(ticks, n_contacts)"""
-        rows = np.arange(first, last) % loop.RECORDS
-        return self.memory.record_inputs[rows, :, loop.CONTACT_FLAGS]
+        rows = np.arange(first, last) % layout.RECORDS
+        return self.memory.record_inputs[rows, :, layout.CONTACT_FLAGS]
 
     def _write(self, cause: str, head: int) -> None:
         ticks = np.arange(max(0, head - KEPT_TICKS), head)
-        rows = ticks % loop.RECORDS
+        rows = ticks % layout.RECORDS
         times = self.memory.record_times[rows]
         inputs = self.memory.record_inputs[rows]
         motion = self.memory.record_motion[rows]
@@ -93,17 +93,17 @@ class BlackBox:
                 buffer,
                 contacts=np.array(self.contacts),
                 tick=ticks,
-                server_time_ns=times[:, loop.START_NS],
-                deadline_ns=times[:, loop.TICK_DEADLINE_NS],
-                compute_time_ns=times[:, loop.COMPUTE_NS],
-                sequence=inputs[:, :, loop.SEQUENCE],
-                client_time_ns=inputs[:, :, loop.CLIENT_TIME_NS],
-                input_age_ns=inputs[:, :, loop.AGE_NS],
-                flags=inputs[:, :, loop.CONTACT_FLAGS],
+                server_time_ns=times[:, layout.START_NS],
+                deadline_ns=times[:, layout.TICK_DEADLINE_NS],
+                compute_time_ns=times[:, layout.COMPUTE_NS],
+                sequence=inputs[:, :, layout.SEQUENCE],
+                client_time_ns=inputs[:, :, layout.CLIENT_TIME_NS],
+                input_age_ns=inputs[:, :, layout.AGE_NS],
+                flags=inputs[:, :, layout.CONTACT_FLAGS],
                 displacement_m=motion[:, :, 0:3],
                 force_n=motion[:, :, 3:6],
-                force_scale=motion[:, :, loop.SCALE],
-                energy_j=motion[:, :, loop.ENERGY_J],
+                force_scale=motion[:, :, layout.SCALE],
+                energy_j=motion[:, :, layout.ENERGY_J],
             )
             write_whole(path, buffer.getvalue())
         except OSError as error:

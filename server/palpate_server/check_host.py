@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from palpate.model import save_model
-from palpate_server import loop, realtime, telemetry, transport
+from palpate_server import layout, loop, realtime, telemetry, transport
 from palpate_server.image import make_image
 from palpate_server.round_trips import RoundTrips, ping_pong, through_a_model
 from palpate_server.safety import Limits
@@ -133,13 +133,13 @@ def _try_priority() -> str | None:
 def timer(seconds: float = _TIMER_S) -> Finding:
     """Lateness of the deadline loop alone."""
     model = spring_mass_model(n_modes=2)
-    memory = loop.make_memory(model.discrete, model.period_s, [Limits(1.0, 1.0, 1.0, 1.0, 0.0)], 1.0)
+    memory = layout.make_memory(model.discrete, model.period_s, [Limits(1.0, 1.0, 1.0, 1.0, 0.0)], 1.0)
     image = make_image(memory)
     loop.stop(memory.shared)
     wake = os.eventfd(0)
     loop.run_at_deadlines(image, wake)  # compiled
-    memory.shared[loop.STOP] = 0
-    memory.shared[loop.DEADLINE_NS] = time.monotonic_ns()
+    memory.shared[layout.STOP] = 0
+    memory.shared[layout.DEADLINE_NS] = time.monotonic_ns()
 
     def run() -> None:
         realtime.raise_priority()
@@ -152,7 +152,7 @@ def timer(seconds: float = _TIMER_S) -> Finding:
     thread.join()
     os.close(wake)
     lateness = telemetry.percentiles(
-        memory.histograms[loop.TIMER_LATENESS], int(memory.longest_ns[loop.TIMER_LATENESS])
+        memory.histograms[layout.TIMER_LATENESS], int(memory.longest_ns[layout.TIMER_LATENESS])
     )
     p50, p99 = lateness["p50"], lateness["p99"]
     assert p50 is not None

@@ -35,26 +35,26 @@ def compiled_exactly(function: Function) -> Function:
 
 
 class _Cache(FunctionCache):
-    """numba's cache on disk, out of date as soon as any file of this package with compiled functions has changed.
+    """numba's cache on disk, under names that change as soon as any file of this package does.
 
-    numba looks at the function's own file alone, though what it stores has the functions of other files in it.
+    numba looks at the function's own file alone, though what it stores has the functions of other files in it. And it
+    reads what is out of date before it finds that out, which fails where a type has moved: so not the stamp, the name.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        stamp = (self._impl.locator.get_source_stamp(), _package_digest())
-        self._cache_file = IndexDataCacheFile(self.cache_path, self._impl.filename_base, stamp)
+        digest = _package_digest()
+        name = f"{self._impl.filename_base}-{digest[:16]}"
+        self._cache_file = IndexDataCacheFile(self.cache_path, name, digest)
 
 
 @cache
 def _package_digest() -> str:
-    """The hash of the names and contents of this package's source files that import from this one, and its own."""
+    """The hash of all names and contents of this package's source files."""
     digest = hashlib.sha256()
     folder = Path(__file__).parent
     for path in sorted(folder.rglob("*.py")):
         source = path.read_bytes()
-        if b".compiled import" not in source and path != Path(__file__):
-            continue
         digest.update(f"{path.relative_to(folder)} {len(source)}\n".encode() + source)
     return digest.hexdigest()
 

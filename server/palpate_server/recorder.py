@@ -21,7 +21,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from palpate_server import loop, wire
+from palpate_server import layout, loop, wire
 from palpate_server.leases import Refused
 
 log = logging.getLogger("palpate_server")
@@ -58,7 +58,9 @@ class _EndedEarlyError(Exception):
 class Recorder:
     """One recording, from its making to `stop`."""
 
-    def __init__(self, path: Path, keys: wire.Keys, description: dict[str, Any], memory: loop.Memory) -> None:
+    def __init__(
+        self, path: Path, keys: wire.Keys, description: dict[str, Any], memory: layout.Memory
+    ) -> None:
         """Raises Refused when the file exists or can't be made, or its process can't be started."""
         self.file = path.name
         self.messages = 0  # handed over
@@ -157,12 +159,12 @@ class Recorder:
     def _take_ticks(self) -> list[tuple[int, str, str, bytes]]:
         memory = self._memory
         head = int(loop.records_written(memory.shared))
-        ticks = np.arange(max(self._next_tick, head - loop.RECORDS), head)
-        rows = ticks % loop.RECORDS
-        starts = memory.record_times[rows, loop.START_NS].tolist()
+        ticks = np.arange(max(self._next_tick, head - layout.RECORDS), head)
+        rows = ticks % layout.RECORDS
+        starts = memory.record_times[rows, layout.START_NS].tolist()
         inputs, motion = memory.record_inputs[rows], memory.record_motion[rows]
         # The loop went on meanwhile: of the oldest rows some may be another tick's already.
-        oldest = int(loop.records_written(memory.shared)) - loop.RECORDS + 1
+        oldest = int(loop.records_written(memory.shared)) - layout.RECORDS + 1
         taken = [
             (start, "force", self._keys.force, self._encoder.encode(tick, start, inputs[k], motion[k]))
             for k, (tick, start) in enumerate(zip(ticks.tolist(), starts, strict=True))

@@ -24,7 +24,7 @@ from mcap.reader import NonSeekingReader
 from numpy.typing import NDArray
 
 from palpate.model import ModelFileError, ReducedModel, load_model
-from palpate_server import loop, safety, wire
+from palpate_server import layout, loop, safety, wire
 from palpate_server.frames import Frame, read_frame
 from palpate_server.image import Image, make_image
 from palpate_server.safety import Flags, Limits
@@ -131,7 +131,7 @@ def compare(session: Session, model: ReducedModel) -> Comparison:
         status["ticks"] for status in session.statuses
     )  # afterwards there may have been a change
     terms = _Terms(session, names)
-    memory: loop.Memory | None = None
+    memory: layout.Memory | None = None
     compared = stretches = lost = 0
     for k, message in enumerate(session.forces):
         tick = message["tick"]
@@ -157,7 +157,7 @@ def compare(session: Session, model: ReducedModel) -> Comparison:
         loop.repeat_tick(image, message["server_time_ns"])
         compared += 1
         lost += sum(missing)
-        if difference := _difference(message, memory, tick % loop.RECORDS):
+        if difference := _difference(message, memory, tick % layout.RECORDS):
             return Comparison(compared, stretches, f"tick {tick}: {difference}", lost)
     return Comparison(compared, stretches, None, lost)
 
@@ -180,13 +180,13 @@ def _known_rest(session: Session, model: ReducedModel) -> NDArray[np.bool_]:
     return known
 
 
-def _memory_at_rest(session: Session, model: ReducedModel, k: int) -> loop.Memory:
+def _memory_at_rest(session: Session, model: ReducedModel, k: int) -> layout.Memory:
     """The loop's memory before the k-th recorded tick; with the forces before it, which a device may still be rendering."""
     limits = Limits(**session.description["limits"])
-    memory = loop.make_memory(model.discrete, model.period_s, [limits] * len(model.contacts), 1.0)
-    memory.counters[loop.TICKS] = memory.shared[loop.HEAD] = session.forces[k]["tick"]
-    for message in session.forces[max(0, k - loop.RECORDS + 1) : k]:
-        memory.record_motion[message["tick"] % loop.RECORDS, :, 3:6] = message["force_n"]
+    memory = layout.make_memory(model.discrete, model.period_s, [limits] * len(model.contacts), 1.0)
+    memory.counters[layout.TICKS] = memory.shared[layout.HEAD] = session.forces[k]["tick"]
+    for message in session.forces[max(0, k - layout.RECORDS + 1) : k]:
+        memory.record_motion[message["tick"] % layout.RECORDS, :, 3:6] = message["force_n"]
     return memory
 
 
@@ -239,7 +239,7 @@ def _is_missing(session: Session, contact: int, name: str, message: dict[str, An
 
 
 def _hand_over(
-    session: Session, memory: loop.Memory, contact: int, name: str, message: dict[str, Any]
+    session: Session, memory: layout.Memory, contact: int, name: str, message: dict[str, Any]
 ) -> None:
     """Put the command that the recorded tick used, or one like it, where the repeated tick will find it."""
     sequence, client_time_ns = message["sequence"][contact], message["client_time_ns"][contact]
@@ -262,13 +262,13 @@ def _hand_over(
     )
 
 
-def _difference(message: dict[str, Any], memory: loop.Memory, row: int) -> str | None:
+def _difference(message: dict[str, Any], memory: layout.Memory, row: int) -> str | None:
     motion = memory.record_motion[row]
-    flags = memory.record_inputs[row, :, loop.CONTACT_FLAGS] & ~_OF_THE_TICK
+    flags = memory.record_inputs[row, :, layout.CONTACT_FLAGS] & ~_OF_THE_TICK
     for name, recorded, repeated in (
         ("displacement_m", message["displacement_m"], motion[:, 0:3].tolist()),
         ("force_n", message["force_n"], motion[:, 3:6].tolist()),
-        ("force_scale", message["force_scale"], motion[:, loop.SCALE].tolist()),
+        ("force_scale", message["force_scale"], motion[:, layout.SCALE].tolist()),
         ("flags", [f & ~_OF_THE_TICK for f in message["flags"]], flags.tolist()),
     ):
         if recorded != repeated:

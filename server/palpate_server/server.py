@@ -19,7 +19,7 @@ import numpy as np
 import zenoh
 
 from palpate.model import ModelFileError, ReducedModel, StateSpace, load_model
-from palpate_server import loop, realtime, safety, telemetry, wire
+from palpate_server import layout, loop, realtime, safety, telemetry, wire
 from palpate_server.black_box import BlackBox
 from palpate_server.devices import PROFILES, Device, limits_for, warnings_for
 from palpate_server.frames import Frame, read_frame
@@ -72,7 +72,7 @@ class Server:
         self.leases = Leases(self.names, limits)
         self.messages = telemetry.MessageCounters(len(self.names))
         self.surface_period_s = 1 / surface_hz
-        self.memory = loop.make_memory(
+        self.memory = layout.make_memory(
             model.discrete, model.period_s, [limits] * len(self.names), self.surface_period_s
         )
         self.image = make_image(self.memory)
@@ -90,6 +90,7 @@ class Server:
         self._black_box = (
             BlackBox(black_box, keys.session, self.names, self.memory) if black_box is not None else None
         )
+        self._alive: set[str] = set()  # clients whose liveliness token is known
         self._contact_index = {name: i for i, name in enumerate(self.names)}
         self._command_thread_raised = False
         self._last_sequence = [-1] * len(self.names)
@@ -131,6 +132,7 @@ class Server:
             session.liveliness().declare_subscriber(
                 keys.client("*"),
                 lambda sample: self._queue(_LEASES_FIRST, lambda: self._on_liveliness(sample)),
+                history=True,
             ),
             session.declare_subscriber(keys.command("*"), self._on_command),
         ]
@@ -146,7 +148,7 @@ class Server:
         if notice := realtime.lock_memory():
             log.warning(notice)
         realtime.calm_interpreter()
-        self.memory.shared[loop.DEADLINE_NS] = time.monotonic_ns() + self.memory.period_ns[0]
+        self.memory.shared[layout.DEADLINE_NS] = time.monotonic_ns() + self.memory.period_ns[0]
         for thread in self._threads:
             thread.start()
         # Last, as the sign that everything else answers.
@@ -248,8 +250,8 @@ class Server:
                 self.messages.unsent_forces += head - self._sent - MAX_UNSENT
                 self._sent = head - MAX_UNSENT
             while self._sent < head:
-                row = self._sent % loop.RECORDS
-                start_ns = int(memory.record_times[row, loop.START_NS])
+                row = self._sent % layout.RECORDS
+                start_ns = int(memory.record_times[row, layout.START_NS])
                 payload = self._encoder.encode(
                     self._sent, start_ns, memory.record_inputs[row], memory.record_motion[row]
                 )
@@ -429,7 +431,9 @@ class Server:
         }
 
     def _check_alive(self, client: str) -> None:
-        token = self.keys.client(client)
+        if client in self._alive:
+            return
+        token = self.keys.client(client)  # may be so new that we have not been told of it
         replies = self.session.liveliness().get(token, timeout=_ALIVE_TIMEOUT_S)
         if not any(reply.ok is not None for reply in replies):
             raise Refused("not_alive", f"client {client!r} has no liveliness token at {token}")
@@ -538,7 +542,7 @@ class Server:
         try:
             model = self._read_model(request.get("model"))
             displacement = self.memory.displacement.ravel().copy()
-            following = loop.make_model(model.discrete, displacement)
+            following = layout.make_model(model.discrete, displacement)
             step = model.period_s / FADE_OVER_S
             fading = self.memory._replace(next_model=following, fade=np.array([0.0, step]))
             self._undisturbed_since_tick = self._between_ticks(loop.exchange, make_image(fading))
@@ -626,8 +630,11 @@ class Server:
         return released
 
     def _on_liveliness(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.DELETE:
-            client = wire.last_chunk(str(sample.key_expr))
+        client = wire.last_chunk(str(sample.key_expr))
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._alive.add(client)
+        else:
+            self._alive.discard(client)
             for name in self._release(client):
                 log.info("client %s is gone: contact %s is free", client, name)
 
@@ -676,7 +683,7 @@ def warm_up(period_s: float, n_contacts: int) -> None:
         np.zeros((channels, channels)),
     )
     limits = [Limits(1.0, 1.0, 1.0, 1.0, 1.0)] * n_contacts
-    memory = loop.make_memory(system, period_s, limits, 1 / USUAL_SURFACE_HZ)
+    memory = layout.make_memory(system, period_s, limits, 1 / USUAL_SURFACE_HZ)
     loop.write_command(memory.commands, 0, 1, 1, 1, -1, wire.STILL, wire.STILL)
     loop.forget_command(memory.commands, 0)
     image = make_image(memory)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.model import ReducedModel
-from palpate_server import loop
+from palpate_server import layout, loop
 from palpate_server.leases import Leases
 from palpate_server.safety import Flags
 from palpate_server.wire import DROPPED, MALFORMED, REFUSED
@@ -51,28 +51,28 @@ def percentiles(counts: NDArray[np.int64], longest_ns: int) -> dict[str, float |
     return {"p50": at(0.5), "p99": at(0.99), "p99_9": at(0.999), "max": longest_s}
 
 
-def recent_success_rate(memory: loop.Memory, contact: int) -> float:
+def recent_success_rate(memory: layout.Memory, contact: int) -> float:
     """Share of the last 100 ticks in which a new command of the contact's client had come in time."""
     head = int(loop.records_written(memory.shared))
     if head == 0:
         return 0.0
-    ticks = np.arange(max(0, head - ROLLING_TICKS), head) % loop.RECORDS
-    flags = memory.record_inputs[ticks, contact, loop.CONTACT_FLAGS]
+    ticks = np.arange(max(0, head - ROLLING_TICKS), head) % layout.RECORDS
+    flags = memory.record_inputs[ticks, contact, layout.CONTACT_FLAGS]
     late = Flags.HELD | Flags.DECAYING | Flags.STALE
     return float(np.mean(flags & int(late) == 0))
 
 
-def dropped(memory: loop.Memory, messages: MessageCounters) -> dict[str, int]:
+def dropped(memory: layout.Memory, messages: MessageCounters) -> dict[str, int]:
     """What was accepted or made and then not used, by reason, as in wire.DROPPED.
 
     A command that waits for the tick at this moment is not yet used and counts as superseded until it is.
     """
-    used = memory.tallies[:, loop.FRESH_TICKS].tolist()
+    used = memory.tallies[:, layout.FRESH_TICKS].tolist()
     superseded = sum(messages.accepted_of) - sum(used)
     return dict(zip(DROPPED, (max(0, superseded), messages.unsent_forces), strict=True))
 
 
-def success_rate(memory: loop.Memory, contact: int) -> float | None:
+def success_rate(memory: layout.Memory, contact: int) -> float | None:
     """Share of the ticks since the start in which a new command had come in time, of those with a client; None without."""
     commanded, fresh = memory.tallies[contact].tolist()
     return fresh / commanded if commanded else None
@@ -82,7 +82,7 @@ def status(
     state: str,
     server_time_ns: int,
     model: ReducedModel,
-    memory: loop.Memory,
+    memory: layout.Memory,
     messages: MessageCounters,
     leases: Leases,
     undisturbed_since_tick: int,
@@ -91,23 +91,23 @@ def status(
     """The status message; `state` is "running" or "stopping", `recording` what its recorder reports."""
     ticks = memory.counters.tolist()
     durations = {
-        "timer_lateness_s": loop.TIMER_LATENESS,
-        "tick_lateness_s": loop.TICK_LATENESS,
-        "compute_time_s": loop.COMPUTE_TIME,
-        "input_age_s": loop.INPUT_AGE,
+        "timer_lateness_s": layout.TIMER_LATENESS,
+        "tick_lateness_s": layout.TICK_LATENESS,
+        "compute_time_s": layout.COMPUTE_TIME,
+        "input_age_s": layout.INPUT_AGE,
     }
     return {
         "state": state,
         "server_time_ns": server_time_ns,
         "model": {"name": model.name, "order": model.order, "config_sha256": model.config_sha256},
         "undisturbed_since_tick": undisturbed_since_tick,
-        "at_rest_since_tick": ticks[loop.AT_REST_SINCE],
-        "ticks": ticks[loop.TICKS],
-        "ticks_on_arrival": ticks[loop.TICKS_ON_ARRIVAL],
-        "late_ticks": ticks[loop.LATE_TICKS],
-        "caught_up_ticks": ticks[loop.CAUGHT_UP_TICKS],
-        "skipped_ticks": ticks[loop.SKIPPED_TICKS],
-        "faults": ticks[loop.FAULTS],
+        "at_rest_since_tick": ticks[layout.AT_REST_SINCE],
+        "ticks": ticks[layout.TICKS],
+        "ticks_on_arrival": ticks[layout.TICKS_ON_ARRIVAL],
+        "late_ticks": ticks[layout.LATE_TICKS],
+        "caught_up_ticks": ticks[layout.CAUGHT_UP_TICKS],
+        "skipped_ticks": ticks[layout.SKIPPED_TICKS],
+        "faults": ticks[layout.FAULTS],
         **{
             name: percentiles(memory.histograms[row].copy(), int(memory.longest_ns[row]))
             for name, row in durations.items()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from palpate.model import ReducedModel
-from palpate_server import loop
+from palpate_server import layout, loop
 from palpate_server.black_box import BlackBox
 from palpate_server.image import make_image
 from palpate_server.safety import Limits
@@ -18,31 +18,31 @@ from palpate_server.safety import Limits
 PERIOD_NS = 1_000_000
 
 
-def run(memory: loop.Memory, ticks: int, depth_m: float, first: int = 0) -> None:
+def run(memory: layout.Memory, ticks: int, depth_m: float, first: int = 0) -> None:
     image = make_image(memory)
     for i in range(first, first + ticks):
         now = time.monotonic_ns()
-        memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS // 4
+        memory.shared[layout.DEADLINE_NS] = now + PERIOD_NS // 4
         loop.write_command(memory.commands, 0, i, 7, now, -1, (0.0, 0.0, depth_m), (0.0, 0.0, 0.0))
         loop.tick_on_arrival(image, now)
 
 
-def silence(memory: loop.Memory, ticks: int) -> None:
+def silence(memory: layout.Memory, ticks: int) -> None:
     image = make_image(memory)
     loop.forget_command(memory.commands, 0)
     for _ in range(ticks):
         now = time.monotonic_ns()
-        memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS // 4
+        memory.shared[layout.DEADLINE_NS] = now + PERIOD_NS // 4
         loop.tick_on_arrival(image, now)
 
 
 @pytest.fixture
-def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> loop.Memory:
+def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> layout.Memory:
     model = make_spring_mass_model()
-    return loop.make_memory(model.discrete, model.period_s, [Limits(0.01, 1e9, 1e6, 1.0, 0.0)], 1 / 30)
+    return layout.make_memory(model.discrete, model.period_s, [Limits(0.01, 1e9, 1e6, 1.0, 0.0)], 1 / 30)
 
 
-def test_nothing_is_written_while_all_is_well(memory: loop.Memory, tmp_path: Path) -> None:
+def test_nothing_is_written_while_all_is_well(memory: layout.Memory, tmp_path: Path) -> None:
     box = BlackBox(tmp_path, "s", ["tip"], memory)
     silence(memory, 10)  # nobody has come yet: stale, but no event
     assert box.examine() is None
@@ -51,7 +51,9 @@ def test_nothing_is_written_while_all_is_well(memory: loop.Memory, tmp_path: Pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_stale_input_is_written_once_with_the_ticks_before_it(memory: loop.Memory, tmp_path: Path) -> None:
+def test_a_stale_input_is_written_once_with_the_ticks_before_it(
+    memory: layout.Memory, tmp_path: Path
+) -> None:
     box = BlackBox(tmp_path / "new", "s", ["tip"], memory)
     run(memory, 2500, 1e-9)
     assert box.examine() is None
@@ -70,7 +72,7 @@ def test_a_stale_input_is_written_once_with_the_ticks_before_it(memory: loop.Mem
     assert box.examine() is None  # too soon after the last one
 
 
-def test_a_fault_and_a_storm_of_limits_are_named(memory: loop.Memory, tmp_path: Path) -> None:
+def test_a_fault_and_a_storm_of_limits_are_named(memory: layout.Memory, tmp_path: Path) -> None:
     box = BlackBox(tmp_path, "s", ["tip"], memory)
     run(memory, 1500, 1e-2)  # beyond the force limit all the time
     writing = box.examine()
@@ -87,7 +89,7 @@ def test_a_fault_and_a_storm_of_limits_are_named(memory: loop.Memory, tmp_path: 
 
 
 def test_a_folder_that_cannot_be_written_is_only_a_warning(
-    memory: loop.Memory, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    memory: layout.Memory, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("")
     box = BlackBox(tmp_path / "file", "s", ["tip"], memory)

@@ -12,7 +12,7 @@ import pytest
 from numba import njit
 
 from palpate.model import ReducedModel, StateSpace
-from palpate_server import atomics, loop, safety
+from palpate_server import atomics, layout, loop, safety
 from palpate_server.image import make_image
 from palpate_server.safety import Flags, Limits
 
@@ -20,32 +20,34 @@ FREE = Limits(1e6, 1e12, 1e6, 1e6, 0.0)  # limits that nothing here reaches
 PERIOD_NS = 1_000_000
 
 
-def command(memory: loop.Memory, sequence: int, target: tuple[float, float, float], age_ns: int = 0) -> None:
+def command(
+    memory: layout.Memory, sequence: int, target: tuple[float, float, float], age_ns: int = 0
+) -> None:
     loop.write_command(
         memory.commands, 0, sequence, 7, time.monotonic_ns() - age_ns, -1, target, (0.0, 0.0, 0.0)
     )
 
 
-def tick(memory: loop.Memory) -> tuple[int, np.ndarray, np.ndarray, float]:
+def tick(memory: layout.Memory) -> tuple[int, np.ndarray, np.ndarray, float]:
     """Run one tick on arrival; its flags, applied displacement, force and scale."""
     now = time.monotonic_ns()
-    memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS // 4
+    memory.shared[layout.DEADLINE_NS] = now + PERIOD_NS // 4
     assert loop.tick_on_arrival(make_image(memory), now) == 1
-    row = (loop.records_written(memory.shared) - 1) % loop.RECORDS
+    row = (loop.records_written(memory.shared) - 1) % layout.RECORDS
     motion = memory.record_motion[row, 0]
-    flags = int(memory.record_inputs[row, 0, loop.CONTACT_FLAGS]) & ~int(Flags.LATE)
-    return flags, motion[0:3].copy(), motion[3:6].copy(), float(motion[loop.SCALE])
+    flags = int(memory.record_inputs[row, 0, layout.CONTACT_FLAGS]) & ~int(Flags.LATE)
+    return flags, motion[0:3].copy(), motion[3:6].copy(), float(motion[layout.SCALE])
 
 
 @pytest.fixture
-def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> loop.Memory:
+def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> layout.Memory:
     model = make_spring_mass_model()
-    return loop.make_memory(model.discrete, model.period_s, [FREE], 1 / 30)
+    return layout.make_memory(model.discrete, model.period_s, [FREE], 1 / 30)
 
 
 @pytest.fixture
-def stop_threads() -> Iterator[Callable[[loop.Memory, threading.Thread], None]]:
-    running: list[tuple[loop.Memory, threading.Thread]] = []
+def stop_threads() -> Iterator[Callable[[layout.Memory, threading.Thread], None]]:
+    running: list[tuple[layout.Memory, threading.Thread]] = []
     yield lambda memory, thread: running.append((memory, thread))
     for memory, thread in running:
         loop.stop(memory.shared)
@@ -53,7 +55,7 @@ def stop_threads() -> Iterator[Callable[[loop.Memory, threading.Thread], None]]:
         assert not thread.is_alive()
 
 
-def test_without_a_command_the_force_is_zero_and_stale_and_nothing_is_echoed(memory: loop.Memory) -> None:
+def test_without_a_command_the_force_is_zero_and_stale_and_nothing_is_echoed(memory: layout.Memory) -> None:
     command(memory, 1, (0.0, 0.0, 0.0))
     tick(memory)
     for _ in range(2):
@@ -68,7 +70,7 @@ def test_without_a_command_the_force_is_zero_and_stale_and_nothing_is_echoed(mem
 
 
 def test_forces_are_the_discrete_models_response_to_the_applied_displacements(
-    memory: loop.Memory, make_spring_mass_model: Callable[..., ReducedModel]
+    memory: layout.Memory, make_spring_mass_model: Callable[..., ReducedModel]
 ) -> None:
     system = make_spring_mass_model().discrete
     state = np.zeros(system.order)
@@ -81,7 +83,7 @@ def test_forces_are_the_discrete_models_response_to_the_applied_displacements(
     assert scale == 1
 
 
-def test_force_fades_in_after_the_first_command(memory: loop.Memory) -> None:
+def test_force_fades_in_after_the_first_command(memory: layout.Memory) -> None:
     scales = []
     for i in range(250):
         command(memory, i, (0.0, 0.0, 1e-3))
@@ -92,7 +94,7 @@ def test_force_fades_in_after_the_first_command(memory: loop.Memory) -> None:
     assert scales[-1] == 1
 
 
-def test_a_silent_client_is_held_then_faded_to_zero_and_withdrawn(memory: loop.Memory) -> None:
+def test_a_silent_client_is_held_then_faded_to_zero_and_withdrawn(memory: layout.Memory) -> None:
     for i in range(250):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
@@ -116,7 +118,7 @@ def test_a_silent_client_is_held_then_faded_to_zero_and_withdrawn(memory: loop.M
     np.testing.assert_array_equal(applied, 0)
 
 
-def test_a_forgotten_client_fades_without_being_held(memory: loop.Memory) -> None:
+def test_a_forgotten_client_fades_without_being_held(memory: layout.Memory) -> None:
     for i in range(250):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
@@ -127,7 +129,7 @@ def test_a_forgotten_client_fades_without_being_held(memory: loop.Memory) -> Non
     assert applied[2] == 1e-3  # the tip stays while somebody may still feel it
 
 
-def test_recovery_in_the_middle_of_the_fading_goes_on_from_there(memory: loop.Memory) -> None:
+def test_recovery_in_the_middle_of_the_fading_goes_on_from_there(memory: layout.Memory) -> None:
     for i in range(250):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
@@ -142,7 +144,9 @@ def test_recovery_in_the_middle_of_the_fading_goes_on_from_there(memory: loop.Me
 
 def test_a_jump_is_followed_at_the_speed_limit(make_spring_mass_model: Callable[..., ReducedModel]) -> None:
     model = make_spring_mass_model()
-    memory = loop.make_memory(model.discrete, model.period_s, [FREE._replace(max_speed_m_per_s=0.5)], 1 / 30)
+    memory = layout.make_memory(
+        model.discrete, model.period_s, [FREE._replace(max_speed_m_per_s=0.5)], 1 / 30
+    )
     depths = []
     for i in range(40):
         command(memory, i, (0.0, 0.0, 0.009))
@@ -155,7 +159,7 @@ def test_a_jump_is_followed_at_the_speed_limit(make_spring_mass_model: Callable[
 
 
 def test_a_jump_that_no_hold_explains_fades_the_force_until_the_tip_is_there_then_softly_in(
-    spring: loop.Memory,
+    spring: layout.Memory,
 ) -> None:
     for i in range(300):
         command(spring, i, (0.0, 0.0, 1e-3))
@@ -181,7 +185,7 @@ def test_a_jump_that_no_hold_explains_fades_the_force_until_the_tip_is_there_the
         assert not flags & Flags.JUMPED
 
 
-def test_a_model_that_gives_nan_is_put_to_rest_and_counted(memory: loop.Memory) -> None:
+def test_a_model_that_gives_nan_is_put_to_rest_and_counted(memory: layout.Memory) -> None:
     for i in range(10):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
@@ -190,14 +194,14 @@ def test_a_model_that_gives_nan_is_put_to_rest_and_counted(memory: loop.Memory) 
     assert flags & Flags.FAULT
     assert scale == 0
     np.testing.assert_array_equal(force, 0)
-    assert memory.counters[loop.FAULTS] == 1
+    assert memory.counters[layout.FAULTS] == 1
     flags, _, force, _ = tick(memory)
     assert not flags & Flags.FAULT
     assert np.all(np.isfinite(force))
 
 
 def test_commands_and_forces_are_in_the_holders_frame(
-    memory: loop.Memory, make_spring_mass_model: Callable[..., ReducedModel]
+    memory: layout.Memory, make_spring_mass_model: Callable[..., ReducedModel]
 ) -> None:
     system = make_spring_mass_model().discrete
     rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -220,13 +224,13 @@ SPRING_N_PER_M = 1000.0
 
 
 @pytest.fixture
-def spring() -> loop.Memory:
+def spring() -> layout.Memory:
     """A spring without memory: what it gives is the displacement of this very tick."""
     nothing = np.zeros(2), np.zeros(2), np.zeros((2, 3)), np.zeros((3, 2))
-    return loop.make_memory(StateSpace(*nothing, SPRING_N_PER_M * np.eye(3)), 1e-3, [USUAL], 1 / 30)
+    return layout.make_memory(StateSpace(*nothing, SPRING_N_PER_M * np.eye(3)), 1e-3, [USUAL], 1 / 30)
 
 
-def hand_over(memory: loop.Memory, scale: float, origin: tuple[float, float, float]) -> None:
+def hand_over(memory: layout.Memory, scale: float, origin: tuple[float, float, float]) -> None:
     """What acquiring does: silence, then the next holder's frame."""
     image = make_image(memory)
     loop.forget_command(memory.commands, 0)
@@ -238,7 +242,7 @@ def hand_over(memory: loop.Memory, scale: float, origin: tuple[float, float, flo
     loop.set_frame(image, 0, np.eye(3), scale, np.array(origin))
 
 
-def test_the_next_client_starts_at_rest_whatever_the_one_before_did(spring: loop.Memory) -> None:
+def test_the_next_client_starts_at_rest_whatever_the_one_before_did(spring: layout.Memory) -> None:
     hand_over(spring, 1000.0, (0.0, 0.0, 0.0))
     for i in range(300):
         command(spring, i, (0.0, 0.0, 0.09))
@@ -256,7 +260,7 @@ def test_the_next_client_starts_at_rest_whatever_the_one_before_did(spring: loop
     assert scale == 1
 
 
-def test_the_workspace_is_around_the_frames_origin(spring: loop.Memory) -> None:
+def test_the_workspace_is_around_the_frames_origin(spring: layout.Memory) -> None:
     origin = np.array([5.0, 0.0, 0.0])
     hand_over(spring, 1.0, (5.0, 0.0, 0.0))
     for i in range(300):
@@ -282,7 +286,7 @@ def test_the_workspace_is_around_the_frames_origin(spring: loop.Memory) -> None:
 
 
 def test_a_reset_puts_the_tip_to_rest_and_takes_the_force_down_at_the_allowed_rate(
-    spring: loop.Memory,
+    spring: layout.Memory,
 ) -> None:
     for i in range(300):
         command(spring, i, (0.0, 0.0, 0.05))
@@ -302,7 +306,7 @@ def test_a_reset_puts_the_tip_to_rest_and_takes_the_force_down_at_the_allowed_ra
 @pytest.mark.parametrize("soft_start_ticks", [20, 100, 300])
 @pytest.mark.parametrize("lowered_to_n", [USUAL.max_force_n, 0.01])
 def test_the_slowest_allowed_rate_lets_every_force_fade_in_time_and_stale_means_zero(
-    spring: loop.Memory, soft_start_ticks: int, lowered_to_n: float
+    spring: layout.Memory, soft_start_ticks: int, lowered_to_n: float
 ) -> None:
     """The model's force is far above the largest one, so that it stands at its limit while its scale already falls."""
     image = make_image(spring)
@@ -333,7 +337,7 @@ def test_extreme_numbers_hold_the_tip_and_leave_another_contact_alone(
     model = make_spring_mass_model(2)
     usual = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
     memory, undisturbed = (
-        loop.make_memory(model.discrete, model.period_s, [usual, usual], 1 / 30) for _ in range(2)
+        layout.make_memory(model.discrete, model.period_s, [usual, usual], 1 / 30) for _ in range(2)
     )
     huge = (sign * 1.797e308,) * 3
     for i in range(300):
@@ -346,15 +350,15 @@ def test_extreme_numbers_hold_the_tip_and_leave_another_contact_alone(
             loop.write_command(memory.commands, 0, i, 7, now - 5_000_000, -1, huge, huge)
         for m in (memory, undisturbed):
             tick(m)
-    row = (loop.records_written(memory.shared) - 1) % loop.RECORDS
+    row = (loop.records_written(memory.shared) - 1) % layout.RECORDS
     np.testing.assert_array_equal(memory.record_motion[row, 0, 0:3], (0.0, 0.0, 1e-3))
     np.testing.assert_array_equal(memory.record_motion[row], undisturbed.record_motion[row])
     assert np.any(memory.record_motion[row, 1, 3:6])
-    assert memory.counters[loop.FAULTS] == 0
+    assert memory.counters[layout.FAULTS] == 0
 
 
 @pytest.mark.parametrize("size", [1e160, 1.797e308, float("inf"), float("nan")])
-def test_a_target_without_a_finite_length_is_not_followed(memory: loop.Memory, size: float) -> None:
+def test_a_target_without_a_finite_length_is_not_followed(memory: layout.Memory, size: float) -> None:
     command(memory, 0, (0.0, 0.0, 1e-3))
     tick(memory)
     command(memory, 1, (size, -size, size))
@@ -364,14 +368,14 @@ def test_a_target_without_a_finite_length_is_not_followed(memory: loop.Memory, s
     assert np.all(np.isfinite(force))
 
 
-def test_a_velocity_carries_the_displacement_on_between_commands(memory: loop.Memory) -> None:
+def test_a_velocity_carries_the_displacement_on_between_commands(memory: layout.Memory) -> None:
     now = time.monotonic_ns()
     loop.write_command(memory.commands, 0, 1, 7, now - 4_000_000, -1, (1e-3, 0.0, 0.0), (0.1, 0.0, 0.0))
     _, applied, *_ = tick(memory)
     assert 1.4e-3 <= applied[0] <= 1.5e-3  # 4 ms at 0.1 m/s, and no more than 5 ms
 
 
-def test_energy_counts_the_force_that_the_device_was_rendering(memory: loop.Memory) -> None:
+def test_energy_counts_the_force_that_the_device_was_rendering(memory: layout.Memory) -> None:
     forces, positions = [], []
     expected = 0.0
     for i in range(100):
@@ -385,12 +389,12 @@ def test_energy_counts_the_force_that_the_device_was_rendering(memory: loop.Memo
             expected += (forces[rendered] if rendered >= 0 else forces[-1]) * step
         forces.append(force[2])
         positions.append(applied[2])
-    row = (loop.records_written(memory.shared) - 1) % loop.RECORDS
-    np.testing.assert_allclose(memory.record_motion[row, 0, loop.ENERGY_J], expected, rtol=1e-9)
+    row = (loop.records_written(memory.shared) - 1) % layout.RECORDS
+    np.testing.assert_allclose(memory.record_motion[row, 0, layout.ENERGY_J], expected, rtol=1e-9)
 
 
 def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(
-    memory: loop.Memory, make_spring_mass_model: Callable[..., ReducedModel]
+    memory: layout.Memory, make_spring_mass_model: Callable[..., ReducedModel]
 ) -> None:
     for i in range(250):
         command(memory, i, (0.0, 0.0, 1e-3))
@@ -407,17 +411,17 @@ def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(
 
 
 def test_another_model_is_faded_in_where_it_settles(
-    memory: loop.Memory, make_spring_mass_model: Callable[..., ReducedModel]
+    memory: layout.Memory, make_spring_mass_model: Callable[..., ReducedModel]
 ) -> None:
     position = (1e-3, -2e-3, 3e-3)
     running = make_spring_mass_model().discrete
     for i in range(300):
         if i == 250:  # the soft start is over: the running model has settled too
-            memory.model.state[:] = loop.make_model(running, np.array(position)).state
+            memory.model.state[:] = layout.make_model(running, np.array(position)).state
         command(memory, i, position)
         *_, before, _ = tick(memory)
     other = make_spring_mass_model(1, 7).discrete
-    following = loop.make_model(other, np.array(position))
+    following = layout.make_model(other, np.array(position))
     settled = following.state.copy()
     np.testing.assert_allclose(other.dense_a() @ settled + other.b @ np.array(position), settled, atol=1e-15)
 
@@ -428,7 +432,7 @@ def test_another_model_is_faded_in_where_it_settles(
     for i in range(300, 400):
         command(memory, i, position)
         now = time.monotonic_ns()
-        memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS // 4
+        memory.shared[layout.DEADLINE_NS] = now + PERIOD_NS // 4
         assert loop.tick_on_arrival(image, now) == 1
         forces.append(memory.device_force[0].copy())
     final = other.c @ settled + other.d @ np.array(position)
@@ -439,68 +443,68 @@ def test_another_model_is_faded_in_where_it_settles(
     done = memory._replace(model=following, snapshot_state=np.zeros(other.order))
     loop.exchange(image, make_image(done))
     command(memory, 400, position)
-    memory.shared[loop.DEADLINE_NS] = time.monotonic_ns() + PERIOD_NS // 4
+    memory.shared[layout.DEADLINE_NS] = time.monotonic_ns() + PERIOD_NS // 4
     loop.tick_on_arrival(image, time.monotonic_ns())
     np.testing.assert_allclose(memory.device_force[0], final, rtol=1e-9)
 
 
-def test_an_early_command_waits_for_the_tick_and_a_second_one_replaces_it(memory: loop.Memory) -> None:
+def test_an_early_command_waits_for_the_tick_and_a_second_one_replaces_it(memory: layout.Memory) -> None:
     now = time.monotonic_ns()
-    memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS - 100_000
+    memory.shared[layout.DEADLINE_NS] = now + PERIOD_NS - 100_000
     command(memory, 1, (0.0, 0.0, 1e-3))
     assert loop.tick_on_arrival(make_image(memory), now) == 0
     command(memory, 2, (0.0, 0.0, 2e-3))
     assert loop.tick_on_arrival(make_image(memory), now + PERIOD_NS * 6 // 10) == 1
-    assert memory.record_inputs[0, 0, loop.SEQUENCE] == 2
+    assert memory.record_inputs[0, 0, layout.SEQUENCE] == 2
     assert loop.tick_on_arrival(make_image(memory), now + PERIOD_NS * 7 // 10) == 0  # one tick each period
 
 
-def test_deadlines_settle_a_quarter_of_a_period_behind_steady_arrivals(memory: loop.Memory) -> None:
+def test_deadlines_settle_a_quarter_of_a_period_behind_steady_arrivals(memory: layout.Memory) -> None:
     start = time.monotonic_ns()
     for offset in (0, 170_000, 480_000, 730_000, 999_000):
-        memory.shared[loop.DEADLINE_NS] = start + offset
+        memory.shared[layout.DEADLINE_NS] = start + offset
         ticks = 0
         for i in range(600):
             ticks += loop.tick_on_arrival(make_image(memory), start + i * PERIOD_NS)
-        phase = (memory.shared[loop.DEADLINE_NS] - start) % PERIOD_NS
+        phase = (memory.shared[layout.DEADLINE_NS] - start) % PERIOD_NS
         assert abs(phase - PERIOD_NS // 4) < PERIOD_NS // 50
         assert abs(ticks - 600) <= 1
 
 
-def test_a_burst_moves_the_deadlines_no_more_than_one_command_does(memory: loop.Memory) -> None:
+def test_a_burst_moves_the_deadlines_no_more_than_one_command_does(memory: layout.Memory) -> None:
     image = make_image(memory)
     now = time.monotonic_ns()
-    memory.shared[loop.DEADLINE_NS] = now + PERIOD_NS * 7 // 10  # too early for the tick to run
+    memory.shared[layout.DEADLINE_NS] = now + PERIOD_NS * 7 // 10  # too early for the tick to run
     for _ in range(100):
         assert loop.tick_on_arrival(image, now) == 0
-    assert memory.shared[loop.DEADLINE_NS] == now + PERIOD_NS * 7 // 10 - 2_000
+    assert memory.shared[layout.DEADLINE_NS] == now + PERIOD_NS * 7 // 10 - 2_000
 
 
-def test_a_released_tissue_comes_to_rest_exactly_and_a_touch_ends_that(memory: loop.Memory) -> None:
-    assert memory.counters[loop.AT_REST_SINCE] == 0
+def test_a_released_tissue_comes_to_rest_exactly_and_a_touch_ends_that(memory: layout.Memory) -> None:
+    assert memory.counters[layout.AT_REST_SINCE] == 0
     for i in range(300):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
-        assert memory.counters[loop.AT_REST_SINCE] == -1
+        assert memory.counters[layout.AT_REST_SINCE] == -1
     loop.forget_command(memory.commands, 0)
     for _ in range(20_000):
         tick(memory)
-        if memory.counters[loop.AT_REST_SINCE] >= 0:
+        if memory.counters[layout.AT_REST_SINCE] >= 0:
             break
         assert np.any(memory.model.state)
     np.testing.assert_array_equal(memory.model.state, 0)
-    ticks = int(memory.counters[loop.TICKS])
-    assert memory.counters[loop.AT_REST_SINCE] == ticks
+    ticks = int(memory.counters[layout.TICKS])
+    assert memory.counters[layout.AT_REST_SINCE] == ticks
     np.testing.assert_array_less(np.abs(memory.record_motion[ticks - 500 : ticks, 0, 3:6]), 1e-9)
     tick(memory)
     np.testing.assert_array_equal(memory.model.state, 0)
-    assert memory.counters[loop.AT_REST_SINCE] == ticks
+    assert memory.counters[layout.AT_REST_SINCE] == ticks
     command(memory, 300, (0.0, 0.0, 1e-3))
     tick(memory)
-    assert memory.counters[loop.AT_REST_SINCE] == -1
+    assert memory.counters[layout.AT_REST_SINCE] == -1
 
 
-def test_ticks_with_a_client_and_those_with_a_new_command_are_counted(memory: loop.Memory) -> None:
+def test_ticks_with_a_client_and_those_with_a_new_command_are_counted(memory: layout.Memory) -> None:
     tick(memory)
     np.testing.assert_array_equal(memory.tallies, [[0, 0]])
     for i in range(10):
@@ -513,64 +517,64 @@ def test_ticks_with_a_client_and_those_with_a_new_command_are_counted(memory: lo
     np.testing.assert_array_equal(memory.tallies, [[20, 10]])
 
 
-def test_missed_ticks_are_made_up_for_and_too_many_are_skipped(memory: loop.Memory) -> None:
+def test_missed_ticks_are_made_up_for_and_too_many_are_skipped(memory: layout.Memory) -> None:
     now = time.monotonic_ns()
-    memory.shared[loop.DEADLINE_NS] = now - 5 * PERIOD_NS - PERIOD_NS // 2
+    memory.shared[layout.DEADLINE_NS] = now - 5 * PERIOD_NS - PERIOD_NS // 2
     assert loop.tick_on_arrival(make_image(memory), now) == 6
-    assert memory.counters[loop.CAUGHT_UP_TICKS] == 5
-    flags = memory.record_inputs[:6, 0, loop.CONTACT_FLAGS]
+    assert memory.counters[layout.CAUGHT_UP_TICKS] == 5
+    flags = memory.record_inputs[:6, 0, layout.CONTACT_FLAGS]
     np.testing.assert_array_equal(flags & int(Flags.CAUGHT_UP) > 0, [True] * 5 + [False])
 
-    memory.shared[loop.DEADLINE_NS] = now - 100 * PERIOD_NS - PERIOD_NS // 2
+    memory.shared[layout.DEADLINE_NS] = now - 100 * PERIOD_NS - PERIOD_NS // 2
     assert loop.tick_on_arrival(make_image(memory), now) == loop.MAX_CATCH_UP
-    assert memory.counters[loop.SKIPPED_TICKS] == 101 - loop.MAX_CATCH_UP
-    assert 0 < memory.shared[loop.DEADLINE_NS] - now < PERIOD_NS
+    assert memory.counters[layout.SKIPPED_TICKS] == 101 - loop.MAX_CATCH_UP
+    assert 0 < memory.shared[layout.DEADLINE_NS] - now < PERIOD_NS
 
 
 def test_the_deadline_loop_steps_once_each_period_of_wall_time(
-    memory: loop.Memory, stop_threads: Callable[[loop.Memory, threading.Thread], None]
+    memory: layout.Memory, stop_threads: Callable[[layout.Memory, threading.Thread], None]
 ) -> None:
     wake = os.eventfd(0)
-    memory.shared[loop.DEADLINE_NS] = start = time.monotonic_ns()
+    memory.shared[layout.DEADLINE_NS] = start = time.monotonic_ns()
     thread = threading.Thread(target=loop.run_at_deadlines, args=(make_image(memory), wake))
     stop_threads(memory, thread)
     thread.start()
     time.sleep(0.5)
     loop.stop(memory.shared)
     thread.join()
-    stopped = memory.shared[loop.DEADLINE_NS]  # of the first tick that did not run
-    ticks = memory.counters[loop.TICKS] + memory.counters[loop.SKIPPED_TICKS]
+    stopped = memory.shared[layout.DEADLINE_NS]  # of the first tick that did not run
+    ticks = memory.counters[layout.TICKS] + memory.counters[layout.SKIPPED_TICKS]
     assert ticks == (stopped - start) // PERIOD_NS
     assert ticks >= 400
     os.close(wake)
 
 
 def test_the_deadline_loop_goes_on_while_python_is_busy(
-    memory: loop.Memory, stop_threads: Callable[[loop.Memory, threading.Thread], None]
+    memory: layout.Memory, stop_threads: Callable[[layout.Memory, threading.Thread], None]
 ) -> None:
     wake = os.eventfd(0)
     thread = threading.Thread(target=loop.run_at_deadlines, args=(make_image(memory), wake))
     stop_threads(memory, thread)
-    memory.shared[loop.DEADLINE_NS] = time.monotonic_ns()
+    memory.shared[layout.DEADLINE_NS] = time.monotonic_ns()
     thread.start()
     time.sleep(0.05)
-    before = memory.counters[loop.TICKS]
+    before = memory.counters[layout.TICKS]
     sorted(range(8_000_000), key=lambda i: -i)  # holds the GIL, with only short breaks
-    assert memory.counters[loop.TICKS] - before > 100
+    assert memory.counters[layout.TICKS] - before > 100
     loop.stop(memory.shared)
     thread.join()
     os.close(wake)
 
 
 @njit(nogil=True)
-def _write_pairs(commands: loop.Commands, n: int) -> None:
+def _write_pairs(commands: layout.Commands, n: int) -> None:
     for i in range(n):
         pair = (float(i), float(i), float(i))
         loop.write_command(commands, 0, i, i, i, -1, pair, pair)
 
 
 @njit(nogil=True)
-def _count_torn(commands: loop.Commands, n: int) -> tuple[int, int]:
+def _count_torn(commands: layout.Commands, n: int) -> tuple[int, int]:
     torn = whole = 0
     for _ in range(n):
         version = atomics.begin_read(commands.versions, 0)
@@ -584,7 +588,7 @@ def _count_torn(commands: loop.Commands, n: int) -> tuple[int, int]:
     return torn, whole
 
 
-def test_a_reader_never_sees_half_a_command(memory: loop.Memory) -> None:
+def test_a_reader_never_sees_half_a_command(memory: layout.Memory) -> None:
     _write_pairs(memory.commands, 1)
     _count_torn(memory.commands, 1)
     writer = threading.Thread(target=_write_pairs, args=(memory.commands, 20_000_000))
@@ -600,7 +604,7 @@ def test_a_reader_never_sees_half_a_command(memory: loop.Memory) -> None:
 
 def test_a_snapshot_belongs_to_one_tick(make_spring_mass_model: Callable[..., ReducedModel]) -> None:
     model = make_spring_mass_model()
-    memory = loop.make_memory(model.discrete, model.period_s, [FREE], 1e-3)
+    memory = layout.make_memory(model.discrete, model.period_s, [FREE], 1e-3)
     system: StateSpace = model.discrete
     expected = np.zeros(system.order)
     state, applied = np.zeros(system.order), np.zeros((1, 3))
@@ -613,18 +617,18 @@ def test_a_snapshot_belongs_to_one_tick(make_spring_mass_model: Callable[..., Re
 
 
 def test_a_force_that_is_no_number_never_reaches_the_device_and_the_next_client_starts_clean(
-    memory: loop.Memory,
+    memory: layout.Memory,
 ) -> None:
     """The last check before the wire, whatever the terms of a contact were: here a limit that is not a number."""
     image = make_image(memory)
     broken = np.array(FREE._replace(max_damping_n_s_per_m=float("nan")))
     loop.set_limits(image, 0, broken)
-    faults = memory.counters[loop.FAULTS]
+    faults = memory.counters[layout.FAULTS]
     for i in range(300):
         command(memory, i, (1e-3 * np.sin(0.3 * i), 0.0, 0.0))
         _, _, force, _ = tick(memory)
         assert np.all(np.isfinite(force))
-    seen = memory.counters[loop.FAULTS] - faults
+    seen = memory.counters[layout.FAULTS] - faults
     assert seen > 0
     loop.set_limits(image, 0, np.array(FREE))
     for i in range(300, 600):

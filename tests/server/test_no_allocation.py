@@ -12,7 +12,7 @@ from numba.core.runtime import _nrt_python as nrt
 from numba.core.runtime.nrt import rtsys
 
 from palpate.model import ReducedModel
-from palpate_server import loop
+from palpate_server import layout, loop
 from palpate_server.image import Image, make_image
 from palpate_server.safety import Flags, Limits
 
@@ -27,13 +27,13 @@ LIMITS = Limits(
 
 
 @njit()
-def silent_ticks(n: int, commands: loop.Commands, image: Image, start_ns: int) -> None:
+def silent_ticks(n: int, commands: layout.Commands, image: Image, start_ns: int) -> None:
     for k in range(n):
         loop.repeat_tick(image, start_ns + k * PERIOD_NS)
 
 
 @njit()
-def commanded_ticks(n: int, commands: loop.Commands, image: Image, start_ns: int) -> None:
+def commanded_ticks(n: int, commands: layout.Commands, image: Image, start_ns: int) -> None:
     """A new command before each tick: a tip that pushes beyond its workspace and comes back at once, again and again."""
     for k in range(n):
         now = start_ns + k * PERIOD_NS
@@ -71,7 +71,7 @@ def allocations(function: Callable[..., object], n: int, *arguments: object) -> 
 class Ticks:
     """A memory with a clock of its own; `flags` are those that were seen in the last run."""
 
-    def __init__(self, memory: loop.Memory) -> None:
+    def __init__(self, memory: layout.Memory) -> None:
         self.memory, self.image, self.now = memory, make_image(memory), 1_000_000_000
         self.flags: list[int] = []
 
@@ -80,8 +80,8 @@ class Ticks:
         count = allocations(ticks, n, self.memory.commands, self.image, self.now)
         assert loop.records_written(self.memory.shared) == first + n
         self.now += n * PERIOD_NS
-        rows = np.arange(first, first + n) % loop.RECORDS
-        self.flags = list(self.memory.record_inputs[rows, 0, loop.CONTACT_FLAGS])
+        rows = np.arange(first, first + n) % layout.RECORDS
+        self.flags = list(self.memory.record_inputs[rows, 0, layout.CONTACT_FLAGS])
         return count
 
     def seen(self, flag: Flags) -> bool:
@@ -91,7 +91,7 @@ class Ticks:
 @pytest.fixture
 def ticks(make_spring_mass_model: Callable[..., ReducedModel]) -> Ticks:
     model = make_spring_mass_model(2)
-    return Ticks(loop.make_memory(model.discrete, model.period_s, [LIMITS, LIMITS], 1 / 30))
+    return Ticks(layout.make_memory(model.discrete, model.period_s, [LIMITS, LIMITS], 1 / 30))
 
 
 def test_the_count_sees_every_array_that_compiled_code_makes() -> None:
@@ -128,7 +128,7 @@ def test_no_tick_allocates_while_one_model_fades_into_another(
     ticks: Ticks, make_spring_mass_model: Callable[..., ReducedModel]
 ) -> None:
     assert ticks.allocations(commanded_ticks, 300) == 0
-    following = loop.make_model(make_spring_mass_model(2, 7).discrete)
+    following = layout.make_model(make_spring_mass_model(2, 7).discrete)
     fading = ticks.memory._replace(next_model=following, fade=np.array([0.0, 0.01]))
     ticks.memory, ticks.image = fading, make_image(fading)
     assert ticks.allocations(commanded_ticks, 50) == 0
@@ -141,14 +141,14 @@ def test_a_tick_with_a_fault_does_not_allocate(ticks: Ticks) -> None:
     ticks.memory.model.state[0] = np.nan
     assert ticks.allocations(commanded_ticks, 10) == 0
     assert ticks.seen(Flags.FAULT)
-    assert ticks.memory.counters[loop.FAULTS] == 1
+    assert ticks.memory.counters[layout.FAULTS] == 1
 
 
 def test_a_tick_that_takes_up_a_change_does_not_allocate(ticks: Ticks) -> None:
     assert ticks.allocations(commanded_ticks, 300) == 0
     loop.set_limits(ticks.image, 0, np.array(LIMITS._replace(max_force_n=0.2)))
     assert ticks.allocations(commanded_ticks, 10) == 0
-    assert ticks.memory.limits[0, loop.MAX_FORCE] == 0.2
+    assert ticks.memory.limits[0, layout.MAX_FORCE] == 0.2
     loop.reset(ticks.image)
     assert ticks.allocations(commanded_ticks, 10) == 0
     assert ticks.seen(Flags.SOFT_START)

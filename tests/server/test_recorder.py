@@ -17,7 +17,7 @@ import pytest
 from mcap.reader import NonSeekingReader, make_reader
 
 from palpate.model import ReducedModel
-from palpate_server import loop, recorder, replay, wire
+from palpate_server import layout, loop, recorder, replay, wire
 from palpate_server.image import make_image
 from palpate_server.leases import Refused
 from palpate_server.recorder import Recorder
@@ -28,9 +28,9 @@ DESCRIPTION = {"session": "test", "period_s": 1e-3}
 
 
 @pytest.fixture
-def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> loop.Memory:
+def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> layout.Memory:
     model = make_spring_mass_model()
-    return loop.make_memory(model.discrete, model.period_s, [Limits(1.0, 1e9, 1e6, 1.0, 0.0)], 1 / 30)
+    return layout.make_memory(model.discrete, model.period_s, [Limits(1.0, 1e9, 1e6, 1.0, 0.0)], 1 / 30)
 
 
 def command(sequence: int) -> bytes:
@@ -39,11 +39,11 @@ def command(sequence: int) -> bytes:
     )
 
 
-def run(recording: Recorder, memory: loop.Memory, ticks: int) -> None:
+def run(recording: Recorder, memory: layout.Memory, ticks: int) -> None:
     """Ticks with a command before each, as fast as they come."""
     image = make_image(memory)
     for _ in range(ticks):
-        tick = int(memory.counters[loop.TICKS])
+        tick = int(memory.counters[layout.TICKS])
         recording.command(KEYS.command("c"), command(tick))
         now = time.monotonic_ns()
         loop.write_command(memory.commands, 0, tick, 7, now, -1, (0.0, 0.0, 1e-4), (0.0, 0.0, 0.0))
@@ -60,14 +60,14 @@ def messages(path: Path) -> list[tuple[str, int, dict[str, Any]]]:
 
 
 def test_commands_and_ticks_are_all_in_the_file_each_command_before_its_tick(
-    memory: loop.Memory, tmp_path: Path
+    memory: layout.Memory, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.mcap"
     began_ns = time.time_ns()
     recording = Recorder(path, KEYS, DESCRIPTION, memory)
     for _ in range(10):
         run(recording, memory, 100)
-        recording.status(wire.pack({"state": "running", "ticks": int(memory.counters[loop.TICKS])}))
+        recording.status(wire.pack({"state": "running", "ticks": int(memory.counters[layout.TICKS])}))
         time.sleep(0.02)  # so that it is written in several portions
     recording.stop()
     assert recording.report() == {"file": "a.mcap", "messages": 2011, "missing_ticks": 0, "error": None}
@@ -96,21 +96,21 @@ def test_commands_and_ticks_are_all_in_the_file_each_command_before_its_tick(
 
 
 def test_ticks_that_were_overwritten_before_they_were_taken_are_counted(
-    memory: loop.Memory, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    memory: layout.Memory, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder, "_PERIOD_S", 60.0)  # it looks once, at the end
     recording = Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)
-    run(recording, memory, loop.RECORDS + 99)
+    run(recording, memory, layout.RECORDS + 99)
     recording.stop()
     # One more than the 99: the oldest row is the one that the next tick writes to.
     assert recording.report()["missing_ticks"] == 100
     assert "100 ticks" in caplog.text
     ticks = [m["tick"] for kind, _, m in messages(tmp_path / "a.mcap") if kind == "force"]
-    assert ticks == list(range(100, loop.RECORDS + 99))
+    assert ticks == list(range(100, layout.RECORDS + 99))
 
 
 def test_a_full_disk_ends_the_recording_with_its_reason_and_what_was_written_is_readable(
-    memory: loop.Memory, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    memory: layout.Memory, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "a.mcap"
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -134,7 +134,7 @@ def test_a_full_disk_ends_the_recording_with_its_reason_and_what_was_written_is_
 
 
 def test_a_process_that_no_longer_takes_anything_ends_the_recording_and_nobody_waits_for_it(
-    memory: loop.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    memory: layout.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder, "_MAX_UNWRITTEN", 100_000)
     monkeypatch.setattr(sys, "executable", str(_script(tmp_path, "exec sleep 30")))
@@ -149,7 +149,7 @@ def test_a_process_that_no_longer_takes_anything_ends_the_recording_and_nobody_w
 
 
 def test_what_is_not_taken_in_time_at_the_end_is_an_error(
-    memory: loop.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    memory: layout.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder, "_END_S", 0.3)
     monkeypatch.setattr(sys, "executable", str(_script(tmp_path, "exec sleep 30")))
@@ -162,7 +162,7 @@ def test_what_is_not_taken_in_time_at_the_end_is_an_error(
 
 
 def test_a_process_that_dies_is_named_with_how_it_ended(
-    memory: loop.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    memory: layout.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "executable", str(_script(tmp_path, "exit 3")))
     recording = Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)
@@ -179,7 +179,7 @@ def _script(folder: Path, line: str) -> Path:
     return script
 
 
-def test_an_existing_file_is_left_alone(memory: loop.Memory, tmp_path: Path) -> None:
+def test_an_existing_file_is_left_alone(memory: layout.Memory, tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_text("kept")
     with pytest.raises(Refused, match=r"a\.mcap exists") as refusal:
         Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from palpate.model import ReducedModel
-from palpate_server import loop, replay, wire
+from palpate_server import layout, loop, replay, wire
 from palpate_server.frames import IDENTITY, Frame
 from palpate_server.image import make_image
 from palpate_server.safety import HOLD_NS, Flags, Limits
@@ -25,7 +25,7 @@ class Recorded:
 
     def __init__(self, model: ReducedModel) -> None:
         self.model = model
-        self.memory = loop.make_memory(model.discrete, model.period_s, [CEILING], 1.0)
+        self.memory = layout.make_memory(model.discrete, model.period_s, [CEILING], 1.0)
         self.image = make_image(self.memory)
         self.encoder = wire.ForceEncoder(1)
         self.random = np.random.default_rng(1)
@@ -45,11 +45,11 @@ class Recorded:
 
     @property
     def tick(self) -> int:
-        return int(self.memory.counters[loop.TICKS])
+        return int(self.memory.counters[layout.TICKS])
 
     @property
     def at_rest_since(self) -> int:
-        return int(self.memory.counters[loop.AT_REST_SINCE])
+        return int(self.memory.counters[layout.AT_REST_SINCE])
 
     def run(self, ticks: int, commanded: bool = False, rendered_tick: int = -1, by_m: float = 1e-3) -> None:
         """Some ticks, each with a new command of its own to somewhere, or without."""
@@ -75,7 +75,7 @@ class Recorded:
                     (0.01, 0.0, 0.0),
                 )
             loop.repeat_tick(self.image, now)
-            row = (self.tick - 1) % loop.RECORDS
+            row = (self.tick - 1) % layout.RECORDS
             payload = self.encoder.encode(
                 self.tick - 1, now, self.memory.record_inputs[row], self.memory.record_motion[row]
             )
@@ -212,7 +212,9 @@ def test_a_force_that_the_device_was_rendering_before_the_stretch_counts_in_its_
     recorded.run(300, commanded=True)
     pressed = recorded.tick - 1
     recorded.come_to_rest()
-    while recorded.tick - pressed > loop.RECORDS - 300:  # so long ago that nobody could still be rendering it
+    while (
+        recorded.tick - pressed > layout.RECORDS - 300
+    ):  # so long ago that nobody could still be rendering it
         recorded.run(100, commanded=True)
         pressed = recorded.tick - 1
         recorded.reset()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.model import ReducedModel
-from palpate_server import loop, telemetry
+from palpate_server import layout, telemetry
 from palpate_server.leases import Leases
 from palpate_server.safety import Flags, Limits
 
@@ -16,14 +16,14 @@ from palpate_server.safety import Flags, Limits
 @pytest.mark.parametrize("scale_ns", [3e3, 5e4, 1e6])
 def test_percentiles_are_right_to_a_bin(scale_ns: float) -> None:
     durations = np.random.default_rng(0).exponential(scale_ns, 20_001).astype(np.int64)
-    bins = np.minimum(durations // 1000, loop.HISTOGRAM_BINS - 1)
-    counts = np.bincount(bins, minlength=loop.HISTOGRAM_BINS)
+    bins = np.minimum(durations // 1000, layout.HISTOGRAM_BINS - 1)
+    counts = np.bincount(bins, minlength=layout.HISTOGRAM_BINS)
     result = telemetry.percentiles(counts, int(durations.max()))
     for name, share in (("p50", 50), ("p99", 99), ("p99_9", 99.9)):
         expected = np.percentile(durations, share, method="inverted_cdf") * 1e-9
         value = result[name]
         assert value is not None
-        if expected < (loop.HISTOGRAM_BINS - 1) * 1e-6:
+        if expected < (layout.HISTOGRAM_BINS - 1) * 1e-6:
             assert 0 <= value - expected <= 1.001e-6
         else:
             assert value == durations.max() * 1e-9  # beyond the bins only the maximum is known
@@ -31,7 +31,7 @@ def test_percentiles_are_right_to_a_bin(scale_ns: float) -> None:
 
 
 def test_an_empty_histogram_has_no_percentiles() -> None:
-    counts = np.zeros(loop.HISTOGRAM_BINS, np.int64)
+    counts = np.zeros(layout.HISTOGRAM_BINS, np.int64)
     assert telemetry.percentiles(counts, 0) == {"p50": None, "p99": None, "p99_9": None, "max": None}
 
 
@@ -40,12 +40,12 @@ def test_success_rate_is_the_share_of_recent_ticks_with_a_new_command(
 ) -> None:
     model = make_spring_mass_model()
     limits = Limits(1.0, 1.0, 1.0, 1.0, 0.0)
-    memory = loop.make_memory(model.discrete, model.period_s, [limits], 1 / 30)
+    memory = layout.make_memory(model.discrete, model.period_s, [limits], 1 / 30)
     assert telemetry.recent_success_rate(memory, 0) == 0
-    memory.shared[loop.HEAD] = 500
-    memory.record_inputs[:500, 0, loop.CONTACT_FLAGS] = int(Flags.STALE)
-    memory.record_inputs[400:480, 0, loop.CONTACT_FLAGS] = int(Flags.SOFT_START)
-    memory.record_inputs[480:490, 0, loop.CONTACT_FLAGS] = int(Flags.HELD)
+    memory.shared[layout.HEAD] = 500
+    memory.record_inputs[:500, 0, layout.CONTACT_FLAGS] = int(Flags.STALE)
+    memory.record_inputs[400:480, 0, layout.CONTACT_FLAGS] = int(Flags.SOFT_START)
+    memory.record_inputs[480:490, 0, layout.CONTACT_FLAGS] = int(Flags.HELD)
     assert telemetry.recent_success_rate(memory, 0) == 0.8
 
 
@@ -54,7 +54,7 @@ def test_the_status_message_is_plain_data(make_spring_mass_model: Callable[..., 
 
     model = make_spring_mass_model(2)
     limits = Limits(1.0, 1.0, 1.0, 1.0, 0.0)
-    memory = loop.make_memory(model.discrete, model.period_s, [limits] * 2, 1 / 30)
+    memory = layout.make_memory(model.discrete, model.period_s, [limits] * 2, 1 / 30)
     leases = Leases(["tip", "tip1"], limits)
     message = telemetry.status("running", 5, model, memory, telemetry.MessageCounters(1), leases, 0, None)
     assert msgpack.unpackb(msgpack.packb(message))["contacts"]["tip1"]["holder"] is None
