@@ -21,13 +21,18 @@ from mcap.writer import CompressionType, Writer
 PROFILE = "palpate"
 _CHUNK_BYTES = 64 * 1024  # a crash loses no more than this
 _NUMBERS = {"type": "array", "items": {"type": "number"}}
-_VECTORS = {"type": "array", "items": _NUMBERS}
+# Foxglove opens a topic when its arrays hold numbers or objects, and its objects say what is in them; arrays of arrays,
+# which the wire has, it refuses. So a force's vectors are written as x, y, z.
+_POINT = {"type": "object", "properties": {axis: {"type": "number"} for axis in "xyz"}}
+_POINTS = {"type": "array", "items": _POINT}
+_MAP: dict[str, Any] = {"type": "object", "properties": {}}
+_VECTORS_OF_A_FORCE = ("displacement_m", "force_n")
 _SCHEMAS: dict[str, dict[str, Any]] = {
     "command": {
         "sequence": {"type": "integer"},
         "client_time_ns": {"type": "integer"},
-        "displacement_m": {"type": "object"},
-        "velocity_m_per_s": {"type": "object"},
+        "displacement_m": _MAP,
+        "velocity_m_per_s": _MAP,
         "rendered_tick": {"type": "integer"},
     },
     "force": {
@@ -37,8 +42,8 @@ _SCHEMAS: dict[str, dict[str, Any]] = {
         "client_time_ns": _NUMBERS,
         "input_age_ns": _NUMBERS,
         "flags": _NUMBERS,
-        "displacement_m": _VECTORS,
-        "force_n": _VECTORS,
+        "displacement_m": _POINTS,
+        "force_n": _POINTS,
         "force_scale": _NUMBERS,
         "energy_j": _NUMBERS,
     },
@@ -66,7 +71,7 @@ class Recording:
 
     def add(self, kind: str, key: str, time_ns: int, payload: bytes) -> None:
         """Write a message, msgpack; one that can't be read is left out (the server counts them). Raises OSError."""
-        data = _as_json(payload)
+        data = _as_json(kind, payload)
         if data is None:
             return
         if key not in self._channels:
@@ -80,13 +85,26 @@ class Recording:
         self._writer.finish()  # type: ignore[no-untyped-call]
 
 
-def _as_json(payload: bytes) -> bytes | None:
+def from_json(kind: str, data: bytes) -> dict[str, Any]:
+    """A message as it was on the wire, from one of a recording."""
+    message: dict[str, Any] = json.loads(data)
+    if kind == "force":
+        for name in _VECTORS_OF_A_FORCE:
+            message[name] = [[point[axis] for axis in "xyz"] for point in message[name]]
+    return message
+
+
+def _as_json(kind: str, payload: bytes) -> bytes | None:
+    # A client's payload can be anything: what msgpack knows and JSON does not, nested without end.
     try:
         message = msgpack.unpackb(payload, raw=False, strict_map_key=True)
-        return json.dumps(_plain(message), allow_nan=False).encode() if type(message) is dict else None
-    except (
-        Exception
-    ):  # a client's payload can be anything: what msgpack knows and JSON does not, nested without end
+        if type(message) is not dict:
+            return None
+        if kind == "force":
+            for name in _VECTORS_OF_A_FORCE:
+                message[name] = [dict(zip("xyz", vector, strict=True)) for vector in message[name]]
+        return json.dumps(_plain(message), allow_nan=False).encode()
+    except Exception:
         return None
 
 

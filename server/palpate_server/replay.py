@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import struct
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ from palpate.model import ModelFileError, ReducedModel, load_model
 from palpate_server import layout, loop, safety, wire
 from palpate_server.frames import Frame, read_frame
 from palpate_server.image import Image, make_image
+from palpate_server.recording import from_json
 from palpate_server.safety import Flags, Limits
 
 _OF_THE_TICK = int(Flags.LATE | Flags.CAUGHT_UP)  # depend on the machine, not on the model
@@ -70,22 +72,26 @@ def read_session(path: Path) -> Session:
     try:
         with path.open("rb") as stream:
             for kind, message in _messages(NonSeekingReader(stream)):
-                if kind == "palpate.describe":
+                if kind == "describe":
                     session = session or Session(message)
                 elif session is None:
                     raise ReplayError(f"{path}: does not begin with a description of the model")
-                elif kind == "palpate.force":
+                elif kind == "force":
                     session.forces.append(message)
-                elif kind == "palpate.status":
+                elif kind == "status":
                     if missing := _NEEDED - message.keys():
                         raise ReplayError(
                             f"{path}: a status has no {', '.join(sorted(missing))}: recorded from another version?"
                         )
                     session.statuses.append(message)
-                elif kind == "palpate.command":
+                elif kind == "command":
                     _add_command(session, message)
     except (McapError, OSError) as error:
         raise ReplayError(f"{path}: not an MCAP file that can be read ({error})") from error
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ReplayError(
+            f"{path}: a message is not as expected ({error!r}): recorded by another version?"
+        ) from error
     if session is None or not session.forces:
         raise ReplayError(f"{path}: holds no forces")
     return session
@@ -98,10 +104,11 @@ def _messages(reader: NonSeekingReader) -> Iterator[tuple[str, dict[str, Any]]]:
             schema, _, message = next(messages)
         except StopIteration:
             return
-        except McapError:
+        except (McapError, struct.error):  # the reader's own, when even a length is cut in two
             return  # it breaks off here: a full disk, a crash
         if schema is not None:
-            yield schema.name, json.loads(message.data)
+            kind = schema.name.removeprefix("palpate.")
+            yield kind, from_json(kind, message.data)
 
 
 def _add_command(session: Session, message: dict[str, Any]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import resource
 import subprocess
 import sys
@@ -21,6 +20,7 @@ from palpate_server import layout, loop, recorder, replay, wire
 from palpate_server.image import make_image
 from palpate_server.leases import Refused
 from palpate_server.recorder import Recorder
+from palpate_server.recording import from_json
 from palpate_server.safety import Limits
 
 KEYS = wire.Keys("test")
@@ -53,9 +53,9 @@ def run(recording: Recorder, memory: layout.Memory, ticks: int) -> None:
 def messages(path: Path) -> list[tuple[str, int, dict[str, Any]]]:
     with path.open("rb") as stream:
         return [
-            (schema.name.removeprefix("palpate."), message.log_time, json.loads(message.data))
+            (kind, message.log_time, from_json(kind, message.data))
             for schema, _, message in NonSeekingReader(stream).iter_messages(log_time_order=False)
-            if schema is not None
+            if schema is not None and (kind := schema.name.removeprefix("palpate."))
         ]
 
 

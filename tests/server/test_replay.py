@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -14,6 +16,7 @@ from palpate.model import ReducedModel
 from palpate_server import layout, loop, replay, wire
 from palpate_server.frames import IDENTITY, Frame
 from palpate_server.image import make_image
+from palpate_server.recording import Recording
 from palpate_server.safety import HOLD_NS, Flags, Limits
 
 CEILING = Limits(10.0, 2000.0, 1.0, 0.1, 5.0)
@@ -258,3 +261,22 @@ def test_another_model_is_refused(
         replay.compare(recorded.session, make_spring_mass_model(1, 6))
     with pytest.raises(replay.ReplayError, match="another configuration"):
         replay.compare(recorded.session, make_spring_mass_model(2))
+
+
+def test_a_recording_can_be_read_wherever_it_breaks_off(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    recording = Recording(stream)
+    recording.add("describe", "palpate/test/describe", 0, wire.pack({"session": "test"}))
+    encoder = wire.ForceEncoder(1)
+    for tick in range(600):
+        inputs, motion = np.full((1, 4), tick, np.int64), np.random.default_rng(tick).normal(size=(1, 8))
+        recording.add("force", "palpate/test/force", tick, encoder.encode(tick, tick, inputs, motion))
+    whole = stream.getvalue()  # all but what is still in the writer's hands: at least two chunks
+    path = tmp_path / "cut.mcap"
+    lengths = []
+    half = len(whole) // 2
+    for cut in (len(whole), *range(len(whole) - 40, len(whole)), *range(half, half + 40)):
+        path.write_bytes(whole[:cut])
+        lengths.append(len(replay.read_session(path).forces))
+    assert lengths[0] > lengths[-1]
+    assert min(lengths) > 0
