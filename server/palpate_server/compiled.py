@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -16,11 +16,11 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Sums may be reordered and fused: that is what vectorises a dot product.
-FAST_MATH = {"reassoc", "contract", "nsz"}
+_FAST_MATH = {"reassoc", "contract", "nsz"}
 
 
 def compiled(function: Function) -> Function:
-    """Compile `function`; Python calls it with the GIL held, so use it for what lasts microseconds."""
+    """Compile `function`, every operation as written; Python calls it with the GIL held, so use it for microseconds."""
     return _compile(function, nogil=False)
 
 
@@ -29,9 +29,13 @@ def compiled_without_gil(function: Function) -> Function:
     return _compile(function, nogil=True)
 
 
-def compiled_exactly(function: Function) -> Function:
-    """Compile `function` with every operation as written: a test for NaN on sums that may be reordered is optimised away."""
-    return _compile(function, nogil=False, fast_math=set())
+def compiled_fast(function: Function) -> Function:
+    """Compile `function` with sums reordered and fused, for loops over a model's order alone.
+
+    Elsewhere how they are reordered differs between two compilations of the same code into different callers, by a bit in
+    one tick of some thousands: a replay would not be exact. And a test for NaN on such sums is optimised away.
+    """
+    return _compile(function, nogil=False, fast_math=_FAST_MATH)
 
 
 class _Cache(FunctionCache):
@@ -59,8 +63,8 @@ def _package_digest() -> str:
     return digest.hexdigest()
 
 
-def _compile(function: Function, *, nogil: bool, fast_math: set[str] = FAST_MATH) -> Function:
-    dispatcher: Any = njit(nogil=nogil, fastmath=fast_math)(function)
+def _compile(function: Function, *, nogil: bool, fast_math: Collection[str] = ()) -> Function:
+    dispatcher: Any = njit(nogil=nogil, fastmath=set(fast_math))(function)
     try:
         dispatcher._cache = _Cache(function)
     except (

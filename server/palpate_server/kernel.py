@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_server.compiled import compiled
+from palpate_server.compiled import compiled_fast
 
 Floats = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ def aligned(values: Floats) -> Floats:
     return copy
 
 
-@compiled
+@compiled_fast
 def output(c: Floats, d: Floats, state: Floats, displacement: Floats, force: Floats) -> None:
     """Write F = C xi + D u into `force`.
 
@@ -44,7 +44,7 @@ def output(c: Floats, d: Floats, state: Floats, displacement: Floats, force: Flo
         force[row] = total
 
 
-@compiled
+@compiled_fast
 def update(
     diagonal: Floats, cross: Floats, b_transposed: Floats, state: Floats, displacement: Floats
 ) -> None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_server.compiled import compiled, compiled_exactly
+from palpate_server.compiled import compiled
 
 Floats = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def reconstruct(target: Floats, velocity: Floats, age_ns: int, position: Floats)
         position[i] = target[i] + velocity[i] * seconds
 
 
-@compiled_exactly
+@compiled
 def is_finite(value: float) -> bool:
     return math.isfinite(value)
 
@@ -125,7 +125,7 @@ def fade(scale: float, live: bool, period_ns: int) -> float:
     return max(0.0, scale - period_ns / DECAY_NS)
 
 
-@compiled_exactly
+@compiled
 def all_finite(values: Floats) -> bool:
     """Whether every one of values (n,) is a finite number."""
     for value in values:  # noqa: SIM110, numba has no all()
