@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -55,6 +56,7 @@ def main() -> None:
             [sys.executable, __file__, str(path), "--serve", endpoint, str(out)],
             stdout=subprocess.PIPE,
             text=True,
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},  # as `palpate serve` does: a pool of them would spin
         )
         try:
             assert server.stdout is not None
@@ -80,7 +82,7 @@ def serve(path: Path, endpoint: str, out: Path) -> None:
         while not stop.wait(0.1):
             server.publish_status()
         server.stop()
-    np.savez(out, histograms=server.memory.histograms, longest_ns=server.memory.longest_ns)
+    np.savez(out, histograms=server.service.memory.histograms, longest_ns=server.service.memory.longest_ns)
 
 
 def run(server: int, endpoint: str, seconds: float) -> list[tuple[float, float]]:

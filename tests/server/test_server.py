@@ -14,8 +14,8 @@ import msgpack
 import pytest
 
 from palpate.model import ReducedModel
+from palpate_server import loop, service, wire
 from palpate_server import server as server_module
-from palpate_server import wire
 from palpate_server.leases import Refused
 from palpate_server.safety import Limits
 from palpate_server.server import Server
@@ -54,10 +54,10 @@ def server(make_spring_mass_model: Callable[..., ReducedModel], tmp_path: Path) 
     limits = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
     server = Server(make_spring_mass_model(2), limits, session, wire.Keys("test"), tmp_path)
     wake = os.eventfd(0)
-    thread = threading.Thread(target=server_module.loop.run_at_deadlines, args=(server.image, wake))
+    thread = threading.Thread(target=loop.run_at_deadlines, args=(server.service.image, wake))
     thread.start()
     yield server
-    server_module.loop.stop(server.memory.shared)
+    loop.stop(server.service.memory.shared)
     thread.join()
     os.close(wake)
 
@@ -72,25 +72,25 @@ def test_a_mistake_of_the_servers_is_answered_too(server: Server, caplog: pytest
 def test_acquiring_gives_all_contacts_or_leaves_all_as_they_were(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server, "_check_alive", lambda client: None)
-    server.leases.holders["tip1"] = "first"
-    before = dict(server.leases.holders), dict(server.leases.terms)
-    monkeypatch.setattr(server_module.loop, "is_silent", lambda image, contact: contact == 0)
+    monkeypatch.setattr(server.control, "_has_token", lambda client: True)
+    server.service.leases.holders["tip1"] = "first"
+    before = dict(server.service.leases.holders), dict(server.service.leases.terms)
+    monkeypatch.setattr(loop, "is_silent", lambda image, contact: contact == 0)
     request = {"contacts": ["tip", "tip1"], "frame": {"scale": 2.0}}
     with pytest.raises(Refused, match="fade") as refusal:
-        server._carry_out("first", "acquire", request)
+        server.control.carry_out("first", "acquire", request)
     assert refusal.value.reason == "busy"
-    assert (server.leases.holders, server.leases.terms) == before
+    assert (server.service.leases.holders, server.service.leases.terms) == before
     monkeypatch.undo()
-    monkeypatch.setattr(server, "_check_alive", lambda client: None)
-    assert server._carry_out("first", "acquire", request)["contacts"] == ["tip", "tip1"]
-    assert server.leases.holders == {"tip": "first", "tip1": "first"}
+    monkeypatch.setattr(server.control, "_has_token", lambda client: True)
+    assert server.control.carry_out("first", "acquire", request)["contacts"] == ["tip", "tip1"]
+    assert server.service.leases.holders == {"tip": "first", "tip1": "first"}
 
 
 def test_while_forces_fade_for_a_new_hold_no_command_is_heard(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    server.leases.holders |= {"tip": "first", "tip1": "first"}
+    server.service.leases.holders |= {"tip": "first", "tip1": "first"}
     command = wire.Command(1, 1, {"tip1": wire.STILL}, {"tip1": wire.STILL})
     assert server._why_refused(command, "first") is None
     heard = []
@@ -99,9 +99,9 @@ def test_while_forces_fade_for_a_new_hold_no_command_is_heard(
         heard.append(server._why_refused(command, "first"))
         return True
 
-    monkeypatch.setattr(server_module.loop, "is_silent", listen)
-    monkeypatch.setattr(server, "_check_alive", lambda client: None)
-    server._carry_out("first", "acquire", {"contacts": ["tip", "tip1"]})
+    monkeypatch.setattr(loop, "is_silent", listen)
+    monkeypatch.setattr(server.control, "_has_token", lambda client: True)
+    server.control.carry_out("first", "acquire", {"contacts": ["tip", "tip1"]})
     assert heard == ["not_holder", "not_holder"]
     assert server._why_refused(command, "first") is None
 
@@ -126,13 +126,13 @@ def test_too_many_waiting_queries_are_refused_at_once_and_a_lease_that_ends_is_h
 def test_without_a_tick_a_change_is_refused_and_the_next_one_waits_for_it(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server_module, "_CHANGE_TIMEOUT_S", 0.05)
-    server.leases.holders["tip"] = "first"
-    server_module.loop.stop(server.memory.shared)
+    monkeypatch.setattr(service, "_CHANGE_TIMEOUT_S", 0.05)
+    server.service.leases.holders["tip"] = "first"
+    loop.stop(server.service.memory.shared)
     time.sleep(0.05)  # the tick under way is the last one
     request = {"limits": {"max_force_n": 1.0}}
     for _ in range(2):
         with pytest.raises(Refused, match="no tick") as refusal:
-            server._carry_out("first", "limits", request)
+            server.control.carry_out("first", "limits", request)
         assert refusal.value.reason == "busy"
-    assert server.leases.terms["tip"].limits.max_force_n == 10.0
+    assert server.service.leases.terms["tip"].limits.max_force_n == 10.0

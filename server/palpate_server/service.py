@@ -1,0 +1,105 @@
+"""What is being served: the model that runs, the memory of its ticks, who holds its contacts; shared by all threads."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from typing import Any
+
+from palpate.model import ReducedModel
+from palpate_server import layout, loop, safety, telemetry, wire
+from palpate_server.devices import PROFILES
+from palpate_server.image import make_image
+from palpate_server.leases import Leases, Refused
+from palpate_server.recorder import Recorder
+from palpate_server.safety import Flags, Limits
+
+STATUS_PERIOD_S = 0.1
+_CHANGE_TIMEOUT_S = 1.0
+
+
+class Service:
+    """One model in one session. `limits` are what no client can exceed.
+
+    state                   "running" or "stopping"; `stopping` is set when all threads are to end
+    last_sequence           of the newest command of each contact
+    undisturbed_since_tick  the last reset or change of model: until then a recording can be repeated
+    model_in_use            held while the surface is computed from the model, and while it is exchanged
+    """
+
+    def __init__(self, model: ReducedModel, limits: Limits, keys: wire.Keys, surface_period_s: float) -> None:
+        self.model = model
+        self.limits = limits
+        self.keys = keys
+        self.surface_period_s = surface_period_s
+        self.names = [contact.name for contact in model.contacts]
+        self.contact_index = {name: i for i, name in enumerate(self.names)}
+        self.leases = Leases(self.names, limits)
+        self.messages = telemetry.MessageCounters(len(self.names))
+        self.last_sequence = [-1] * len(self.names)
+        self.memory = layout.make_memory(
+            model.discrete, model.period_s, [limits] * len(self.names), surface_period_s
+        )
+        self.image = make_image(self.memory)
+        self.state = "running"
+        self.stopping = threading.Event()
+        self.undisturbed_since_tick = 0
+        self.recorder: Recorder | None = None
+        self.model_in_use = threading.Lock()
+        self._changing = threading.Lock()  # the loop has one slot for changes
+
+    def forget_commands(self, contacts: Iterable[str]) -> None:
+        """Let the forces of contacts fade from the next tick on."""
+        for name in contacts:
+            loop.forget_command(self.memory.commands, self.contact_index[name])
+
+    def between_ticks(self, ask: Callable[..., None], *what: Any) -> int:
+        """Have the loop change something; the first tick after it. Raises Refused when no tick comes."""
+        with self._changing:
+            self._wait_for_change()
+            ask(self.image, *what)
+            return self._wait_for_change()
+
+    def _wait_for_change(self) -> int:
+        give_up = time.monotonic() + _CHANGE_TIMEOUT_S
+        while (tick := loop.changed_at(self.image)) < 0:
+            if time.monotonic() > give_up:
+                raise Refused(
+                    "busy", "no tick came that could have made the change: the server is overloaded"
+                )
+            time.sleep(self.model.period_s / 4)
+        return tick
+
+    def status(self) -> dict[str, Any]:
+        return telemetry.status(
+            self.state,
+            time.monotonic_ns(),
+            self.model,
+            self.memory,
+            self.messages,
+            self.leases,
+            self.undisturbed_since_tick,
+            None if self.recorder is None else self.recorder.report(),
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """The describe reply: what a client must know before it moves anything."""
+        summary = self.model.summary()
+        summary["evidence"].pop("hankel_singular_values")
+        return {
+            "schema_version": wire.SCHEMA_VERSION,
+            "session": self.keys.session,
+            "period_s": self.model.period_s,
+            "contacts": [asdict(contact) for contact in self.model.contacts],
+            "limits": self.limits._asdict(),
+            "devices": {name: asdict(profile) for name, profile in PROFILES.items()},
+            "hold_s": safety.HOLD_NS * 1e-9,
+            "decay_s": safety.DECAY_NS * 1e-9,
+            "soft_start_s": safety.SOFT_START_NS * 1e-9,
+            "status_period_s": STATUS_PERIOD_S,
+            "surface_period_s": self.surface_period_s,
+            "flags": {flag.name: flag.value for flag in Flags},
+            "model": summary,
+        }
