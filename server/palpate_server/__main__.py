@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import math
 import os
 import signal
 import sys
@@ -20,6 +19,7 @@ import zenoh
 
 from palpate.model import ModelFileError, load_model
 from palpate_server import transport, wire
+from palpate_server.arguments import index, positive
 from palpate_server.safety import Limits, least_force_rate
 from palpate_server.server import FASTEST_SURFACE_HZ, USUAL_SURFACE_HZ, serve
 
@@ -52,8 +52,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         keys = wire.Keys(options.session)
         model = load_model(options.model)
+        models = options.models or options.model.parent
+        if not models.is_dir():
+            raise ValueError(f"--models {models}: no such folder")
+        if options.black_box is not None:
+            _prepare_folder("--black-box", options.black_box)
         if options.recordings is not None:
-            _prepare_recordings(options.recordings)
+            if find_spec("mcap") is None:
+                raise ValueError("--recordings needs the package mcap: install palpate[recorder]")
+            _prepare_folder("--recordings", options.recordings)
         with transport.open_session(options.listen, options.zenoh_config) as session:
             where = options.zenoh_config or options.listen
             contacts = ", ".join(contact.name for contact in model.contacts)
@@ -72,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 keys,
                 stop,
                 announce,
-                options.models or options.model.parent,
+                models,
                 options.black_box,
                 options.surface_hz,
                 options.cpu,
@@ -85,11 +92,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _prepare_recordings(folder: Path) -> None:
-    """Raises OSError when there is no such folder and it can't be made, ValueError when nothing could write to it."""
-    if find_spec("mcap") is None:
-        raise ValueError("--recordings needs the package mcap: install palpate[recorder]")
-    folder.mkdir(parents=True, exist_ok=True)
+def _prepare_folder(option: str, folder: Path) -> None:
+    """Make a folder unless it is there. Raises ValueError when that can't be, or nothing may be written to it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{option} {folder}: can't be made: {error.strerror}") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{option} {folder}: may not be written to")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -144,31 +154,31 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--cpu",
-        type=_index,
+        type=index,
         metavar="N",
         help="keep the threads that run ticks on this processor (default: where the system puts them)",
     )
     limits = parser.add_argument_group("limits", "what no client can exceed, for each contact")
     limits.add_argument(
-        "--max-force-n", type=_positive, default=10.0, metavar="N", help="(default: %(default)s)"
+        "--max-force-n", type=positive, default=10.0, metavar="N", help="(default: %(default)s)"
     )
     limits.add_argument(
         "--max-force-rate-n-per-s",
-        type=_positive,
+        type=positive,
         default=2000.0,
         metavar="N/S",
         help="(default: %(default)s)",
     )
     limits.add_argument(
         "--max-speed-m-per-s",
-        type=_positive,
+        type=positive,
         default=1.0,
         metavar="M/S",
         help="of a tip (default: %(default)s)",
     )
     limits.add_argument(
         "--workspace-m",
-        type=_positive,
+        type=positive,
         default=0.1,
         metavar="M",
         help="longest displacement of a tip (default: %(default)s)",
@@ -177,23 +187,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _surface_rate(text: str) -> float:
-    value = _positive(text)
+    value = positive(text)
     if value > FASTEST_SURFACE_HZ:
         raise argparse.ArgumentTypeError(f"{text} is above {FASTEST_SURFACE_HZ:g}")
-    return value
-
-
-def _index(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is below 0")
-    return value
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
     return value
 
 

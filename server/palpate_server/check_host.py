@@ -1,6 +1,6 @@
 """Is this machine fit to serve forces to a hand? Measures what counts, gives a verdict, and says what to change.
 
-    python -m palpate_server.check_host [--seconds 10]
+    palpate check-host [--seconds 10] [--json]
 
 Exit code 0: good or marginal. 1: not sufficient. 2: it could not be measured.
 """
@@ -15,12 +15,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from palpate.model import save_model
 from palpate_server import layout, loop, realtime, telemetry, transport
+from palpate_server.arguments import positive
 from palpate_server.image import make_image
 from palpate_server.round_trips import RoundTrips, ping_pong, through_a_model
 from palpate_server.safety import Limits
@@ -28,15 +29,19 @@ from palpate_server.sample_model import spring_mass_model
 
 GOOD, MARGINAL, NOT_SUFFICIENT = "good", "marginal", "not sufficient"
 _TIMER_S = 3.0
+_LONGEST_S = 3600.0
 _COMMAND_BYTES, _FORCE_BYTES = 90, 220
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was measured: its value as text, the verdict on it, and what to do when it is not good."""
+    """One thing that was measured: in words and as values with the unit in their names, the verdict on it, and what to
+    do when it is not good.
+    """
 
     name: str
-    value: str
+    text: str
+    values: Mapping[str, float | str | bool | None]
     verdict: str
     advice: str = ""
 
@@ -57,6 +62,7 @@ class Bounds:
 # A hand feels what happens within a few milliseconds; a tick has one.
 TIMER_LATENESS_P99_S = Bounds(100e-6, 500e-6)
 ROUND_TRIP_P99_S = Bounds(1e-3, 3e-3)
+UNANSWERED_SHARE = Bounds(0.01, 0.1)  # of commands: lost, or replaced by a newer one before a tick
 LATE_SHARE = Bounds(0.001, 0.01)
 SKIPPED_SHARE = Bounds(0.0, 0.001)
 LOAD_PER_CPU = Bounds(0.3, 0.8)
@@ -71,12 +77,22 @@ def settings() -> list[Finding]:
     findings = []
     cpus = len(os.sched_getaffinity(0))
     findings.append(
-        Finding("processors", str(cpus), GOOD if cpus >= 2 else MARGINAL, "give the server two processors")
+        Finding(
+            "processors",
+            str(cpus),
+            {"processors": cpus},
+            GOOD if cpus >= 2 else MARGINAL,
+            "give the server two processors",
+        )
     )
     load = os.getloadavg()[0] / cpus
     findings.append(
         Finding(
-            "load per processor", f"{load:.2f}", min_marginal(LOAD_PER_CPU.judge(load)), "stop other programs"
+            "load per processor",
+            f"{load:.2f}",
+            {"load_per_processor": load},
+            min_marginal(LOAD_PER_CPU.judge(load)),
+            "stop other programs",
         )
     )
     preempt = Path("/sys/kernel/realtime")
@@ -85,6 +101,7 @@ def settings() -> list[Finding]:
         Finding(
             "real-time kernel",
             "yes" if real_time else "no",
+            {"real_time_kernel": real_time},
             GOOD if real_time else MARGINAL,
             "a PREEMPT_RT kernel",
         )
@@ -96,13 +113,20 @@ def settings() -> list[Finding]:
             Finding(
                 "frequency governor",
                 name,
+                {"governor": name},
                 GOOD if name == "performance" else MARGINAL,
                 "cpupower frequency-set -g performance",
             )
         )
     refusal = _try_priority()
     findings.append(
-        Finding("real-time priority", refusal or "allowed", MARGINAL if refusal else GOOD, refusal or "")
+        Finding(
+            "real-time priority",
+            refusal or "allowed",
+            {"allowed": refusal is None},
+            MARGINAL if refusal else GOOD,
+            refusal or "",
+        )
     )
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     locked = soft == resource.RLIM_INFINITY or os.geteuid() == 0
@@ -110,6 +134,7 @@ def settings() -> list[Finding]:
         Finding(
             "locked memory",
             "unlimited" if locked else f"{soft} bytes",
+            {"allowed_bytes": None if locked else soft},
             GOOD if locked else MARGINAL,
             "ulimit -l unlimited",
         )
@@ -160,19 +185,16 @@ def timer(seconds: float = _TIMER_S) -> Finding:
     return Finding(
         "timer lateness",
         f"p50 {p50 * 1e6:.0f} us, p99 {p99 * 1e6:.0f} us",
+        {"p50_s": p50, "p99_s": p99},
         TIMER_LATENESS_P99_S.judge(p99),
         "allow real-time priority, use a real-time kernel, stop other programs",
     )
 
 
-def transport_round_trip(seconds: float = _TIMER_S) -> Finding:
+def transport_round_trip(seconds: float = _TIMER_S) -> list[Finding]:
     trips = ping_pong(_COMMAND_BYTES, _FORCE_BYTES, seconds)
-    return Finding(
-        "Zenoh round trip",
-        _text(trips),
-        ROUND_TRIP_P99_S.judge(trips.p99_s),
-        "stop other programs; check what else uses the loopback device",
-    )
+    advice = "stop other programs; check what else uses the loopback device"
+    return [_duration("Zenoh round trip", trips, advice), _unanswered("unanswered pings", trips, advice)]
 
 
 def tick_run(seconds: float) -> list[Finding]:
@@ -184,30 +206,37 @@ def tick_run(seconds: float) -> list[Finding]:
     late = status["late_ticks"] / max(status["ticks"], 1)
     skipped = status["skipped_ticks"] / max(status["ticks"], 1)
     return [
-        Finding(
-            "command to force", _text(trips), ROUND_TRIP_P99_S.judge(trips.p99_s), "see timer and round trip"
-        ),
-        Finding("late ticks", f"{late:.3%}", LATE_SHARE.judge(late), "allow real-time priority"),
-        Finding("skipped ticks", f"{skipped:.3%}", SKIPPED_SHARE.judge(skipped), "stop other programs"),
+        _duration("command to force", trips, "see timer and round trip"),
+        _unanswered("unanswered commands", trips, "see timer and round trip"),
+        _share("late ticks", late, LATE_SHARE, "allow real-time priority"),
+        _share("skipped ticks", skipped, SKIPPED_SHARE, "stop other programs"),
     ]
 
 
-def _text(trips: RoundTrips) -> str:
-    return (
-        f"p50 {trips.p50_s * 1e6:.0f} us, p99 {trips.p99_s * 1e6:.0f} us, {trips.unanswered:.2%} unanswered"
-    )
+def _duration(name: str, trips: RoundTrips, advice: str) -> Finding:
+    text = f"p50 {trips.p50_s * 1e6:.0f} us, p99 {trips.p99_s * 1e6:.0f} us"
+    values = {"p50_s": trips.p50_s, "p99_s": trips.p99_s}
+    return Finding(name, text, values, ROUND_TRIP_P99_S.judge(trips.p99_s), advice)
+
+
+def _unanswered(name: str, trips: RoundTrips, advice: str) -> Finding:
+    return _share(name, trips.unanswered, UNANSWERED_SHARE, advice)
+
+
+def _share(name: str, share: float, bounds: Bounds, advice: str) -> Finding:
+    return Finding(name, f"{share:.3%}", {"share": share}, bounds.judge(share), advice)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="palpate check-host", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of the tick run (%(default)s s)")
+    parser.add_argument(
+        "--seconds", type=_seconds, default=10.0, help="length of the tick run, up to an hour (%(default)s s)"
+    )
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     options = parser.parse_args(arguments)
-    if not options.seconds > 0:
-        parser.error(f"--seconds is {options.seconds}: expected a number above 0")
     hints = settings()
     try:
-        measured = [timer(), transport_round_trip(), *tick_run(options.seconds)]
+        measured = [timer(), *transport_round_trip(), *tick_run(options.seconds)]
     except transport.TransportError as error:
         print(f"palpate check-host: {error}", file=sys.stderr)
         return 2
@@ -218,12 +247,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     else:
         for finding in (*hints, *measured):
-            print(f"{finding.name:20} {finding.verdict:15} {finding.value}")
+            print(f"{finding.name:20} {finding.verdict:15} {finding.text}")
         print(f"\nverdict: {verdict}")
         for finding in (*hints, *measured):
             if finding.verdict != GOOD:
                 print(f"  {finding.name}: {finding.advice}")
     return 1 if verdict == NOT_SUFFICIENT else 0
+
+
+def _seconds(text: str) -> float:
+    value = positive(text)
+    if value > _LONGEST_S:
+        raise argparse.ArgumentTypeError(f"{text!r} is more than {_LONGEST_S:.0f}")
+    return value
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Run a recording's commands through its model again, offline, and compare every force bit for bit.
 
-    python -m palpate_server.replay RECORDING.mcap MODEL.npz
+    palpate replay RECORDING.mcap MODEL.npz
 
 What is repeated begins where everything is known to be at rest, and breaks off where a message was lost, the model was
 reset or another one loaded; from the next rest on it is repeated again.
@@ -20,9 +20,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
+
+from palpate_server.arguments import need
+
+if __name__ == "__main__":
+    need("mcap", "recorder", "palpate replay")
+
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
-from numpy.typing import NDArray
 
 from palpate.model import ModelFileError, ReducedModel, load_model
 from palpate_server import layout, loop, safety, wire
@@ -31,6 +37,7 @@ from palpate_server.image import Image, make_image
 from palpate_server.recording import from_json
 from palpate_server.safety import Flags, Limits
 
+_MAGIC = b"\x89MCAP0\r\n"  # an MCAP file begins with it
 _OF_THE_TICK = int(Flags.LATE | Flags.CAUGHT_UP)  # depend on the machine, not on the model
 _NEEDED = {"ticks", "at_rest_since_tick", "undisturbed_since_tick", "model", "contacts"}  # of a status
 _LIMITED = int(Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED)
@@ -71,6 +78,9 @@ def read_session(path: Path) -> Session:
     session: Session | None = None
     try:
         with path.open("rb") as stream:
+            if stream.read(len(_MAGIC)) != _MAGIC:
+                raise ReplayError(f"{path}: not an MCAP file")
+            stream.seek(0)
             for kind, message in _messages(NonSeekingReader(stream)):
                 if kind == "describe":
                     session = session or Session(message)

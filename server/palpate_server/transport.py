@@ -80,4 +80,7 @@ def _first_cause(error: zenoh.ZError) -> str:
     if syntax:
         line, column, expected = syntax.groups()
         return f"line {line}, column {column}: {' '.join(expected.split())}"
-    return " ".join(text.split(" at /", 1)[0].split()).rstrip(".") or "refused"
+    text = text.removeprefix('Json5Err(Message { msg: "').split(" at /", 1)[0].replace('\\"', '"')
+    if text.count("[") > text.count("]"):  # its end stood behind the place
+        text = "".join(text.rsplit("[", 1))
+    return " ".join(text.split()).rstrip(".") or "refused"

@@ -100,8 +100,7 @@ def test_a_full_disk_ends_the_recording_not_the_server_and_what_was_written_is_r
     recorder = start_recorder(out, served.endpoint, largest_file=100_000)
     _, err = recorder.communicate(timeout=60)
     assert recorder.returncode == 1
-    assert "it ends here" in err
-    assert "Traceback" not in err
+    assert err.splitlines() == [f"palpate record: {out}: File too large; it ends here"]
     session = replay.read_session(out)
     assert len(session.forces) > 100
     with connect(served.endpoint) as client:
@@ -110,26 +109,14 @@ def test_a_full_disk_ends_the_recording_not_the_server_and_what_was_written_is_r
         assert client.next_status()["ticks"] > ticks
 
 
-def test_a_device_that_is_full_ends_the_recording_with_one_line(
-    serve: Callable[..., Any], connect: Callable[..., Any], start_recorder: Callable[..., Any]
-) -> None:
-    served = serve()
-    recorder = start_recorder(Path("/dev/full"), served.endpoint)
-    _, err = recorder.communicate(timeout=60)
-    assert recorder.returncode == 1
-    assert err.splitlines() == ["palpate record: /dev/full: No space left on device; it ends here"]
-    with connect(served.endpoint) as client:
-        ticks = client.statuses[-1]["ticks"]
-        assert client.next_status()["ticks"] > ticks
-
-
 def test_what_is_no_recording_or_not_of_this_model_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "no.mcap"
-    path.write_bytes(b"nothing of the kind")
-    with pytest.raises(replay.ReplayError, match=r"no\.mcap"):
-        replay.read_session(path)
     with pytest.raises(replay.ReplayError, match=r"missing\.mcap"):
         replay.read_session(tmp_path / "missing.mcap")
+    for content in (b"nothing of the kind", b"PK\x03\x04" + bytes(1000), b""):
+        path.write_bytes(content)
+        with pytest.raises(replay.ReplayError, match=r"no\.mcap: not an MCAP file"):
+            replay.read_session(path)
 
 
 # Recordings that the server makes of itself

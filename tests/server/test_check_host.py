@@ -8,6 +8,7 @@ import pytest
 
 from palpate_server import check_host
 from palpate_server.check_host import GOOD, MARGINAL, NOT_SUFFICIENT, Bounds
+from palpate_server.round_trips import RoundTrips
 
 
 def test_a_value_is_judged_by_its_bounds() -> None:
@@ -33,11 +34,35 @@ def test_settings_alone_never_make_a_machine_insufficient() -> None:
     assert all(finding.advice for finding in findings if finding.verdict != GOOD)
 
 
+@pytest.mark.parametrize(
+    ("unanswered", "verdict"), [(0.0, GOOD), (0.01, GOOD), (0.05, MARGINAL), (0.5, NOT_SUFFICIENT)]
+)
+def test_messages_that_get_no_answer_count_however_fast_the_others_are(
+    unanswered: float, verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(check_host, "ping_pong", lambda *_: RoundTrips(1e-4, 2e-4, unanswered))
+    findings = check_host.transport_round_trip()
+    assert check_host.worst([finding.verdict for finding in findings]) == verdict
+    assert {"share": unanswered} in [finding.values for finding in findings]
+
+
 def test_a_check_ends_with_a_verdict_and_says_what_it_measured(capsys: pytest.CaptureFixture[str]) -> None:
     code = check_host.main(["--seconds", "1", "--json"])
     report = json.loads(capsys.readouterr().out)
     assert code == (1 if report["verdict"] == NOT_SUFFICIENT else 0)
     names = {finding["name"] for finding in report["findings"]}
-    assert {"timer lateness", "Zenoh round trip", "command to force", "late ticks", "skipped ticks"} <= names
+    measured = {
+        "timer lateness": {"p50_s", "p99_s"},
+        "Zenoh round trip": {"p50_s", "p99_s"},
+        "unanswered pings": {"share"},
+        "command to force": {"p50_s", "p99_s"},
+        "unanswered commands": {"share"},
+        "late ticks": {"share"},
+        "skipped ticks": {"share"},
+    }
+    assert measured.keys() <= names
     for finding in report["findings"]:
-        assert finding["value"]
+        assert finding["text"]
+        if finding["name"] in measured:
+            assert finding["values"].keys() == measured[finding["name"]]
+            assert all(type(value) is float for value in finding["values"].values())

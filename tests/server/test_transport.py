@@ -52,6 +52,23 @@ def test_a_client_hears_a_geometry_of_a_hundred_thousand_vertices(
     answering.undeclare()
 
 
+@pytest.mark.parametrize("malformed", ["foo", 'a"b', "tcp/", "tcp/127.0.0.1:abc", "nope/127.0.0.1:3"])
+def test_a_malformed_endpoint_is_refused_in_words(malformed: str) -> None:
+    with pytest.raises(transport.TransportError) as caught:
+        transport.open_session(malformed, None)
+    message = str(caught.value)
+    assert message.startswith(f"endpoint {malformed}: ")
+    assert "Json5Err" not in message
+    assert ".rs" not in message
+    assert "\\" not in message
+
+
+def test_an_endpoint_in_use_is_refused_without_loose_brackets(server: zenoh.Session, endpoint: str) -> None:
+    with pytest.raises(transport.TransportError, match="Address already in use") as caught:
+        transport.open_session(endpoint, None)
+    assert str(caught.value).count("[") == str(caught.value).count("]")
+
+
 def test_the_shipped_configuration_has_the_same_bound() -> None:
     shipped = Path(__file__).parents[2] / "configs" / "security" / "server.json5"
     config = zenoh.Config.from_file(shipped)
