@@ -13,12 +13,17 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+
+from palpate_server import transport, wire
+from palpate_server.arguments import need, port
+
+if __name__ == "__main__":
+    need("prometheus_client", "metrics", "palpate_server.metrics")
+
 from prometheus_client import REGISTRY, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
-
-from palpate_server import transport, wire
 
 _COUNTERS = {
     "ticks": "model steps",
@@ -76,14 +81,16 @@ class StatusCollector(Collector):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="palpate_server.metrics", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument(
         "--connect", default=transport.DEFAULT_ENDPOINT, metavar="ENDPOINT", help="(%(default)s)"
     )
     parser.add_argument("--session", default="main", help="(%(default)s)")
     parser.add_argument("--zenoh-config", type=Path, metavar="FILE", help="used instead of --connect")
     parser.add_argument("--address", default="127.0.0.1", help="to listen on (%(default)s)")
-    parser.add_argument("--port", type=int, default=9464, help="to listen on (%(default)s)")
+    parser.add_argument("--port", type=port, default=9464, help="to listen on (%(default)s)")
     options = parser.parse_args(arguments)
     collector = StatusCollector()
     try:
@@ -106,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 0
     except (OSError, ValueError, transport.TransportError) as error:
-        print(f"palpate metrics: {error}", file=sys.stderr)
+        print(f"palpate_server.metrics: {error}", file=sys.stderr)
         return 2
 
 
