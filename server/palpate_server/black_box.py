@@ -20,6 +20,7 @@ log = logging.getLogger("palpate_server")
 KEPT_TICKS = 2000
 STORM_TICKS = 1000  # in so many ticks,
 STORM_SHARE = 0.5  # so large a share with a limit met is a storm
+MOST_FILES = 100  # of a server, however long it runs
 QUIET_S = 10.0  # between two files of one cause
 
 _LIMITED = int(
@@ -34,8 +35,8 @@ _LIMITED = int(
 class BlackBox:
     """Looks at new ticks each time `examine` is called (some times a second) and writes a file when there is cause.
 
-    Causes: `fault` (a force that was not finite), `stale` (a contact's force had to fade to zero), `limits` (half of
-    the last second's ticks met a limit). One file of each cause in QUIET_S; the writing is done by a thread of its own.
+    Causes: `fault` (a force that was not finite), `stale` (a client that holds a contact fell silent, and its force had to
+    fade to zero), `lost` (a client that held a contact was killed or cut off), `limits` (half of the last second's ticks met a limit). One file of each cause in QUIET_S; the writing is done by a thread of its own.
     """
 
     def __init__(self, folder: Path, session: str, contacts: Sequence[str], memory: layout.Memory) -> None:
@@ -44,31 +45,46 @@ class BlackBox:
         self.contacts = list(contacts)
         self.memory = memory
         self._seen = 0
+        self._lost_clients = self._lost_written = 0
+        self._files = 0
         self._last_file_s: dict[str, float] = {}
 
-    def examine(self) -> threading.Thread | None:
-        """The thread that writes a file, when there was cause for one."""
+    def examine(self, lost_clients: int = 0) -> threading.Thread | None:
+        """The thread that writes a file, when there was cause for one. `lost_clients`: how many so far."""
         head = int(loop.records_written(self.memory.shared))
         first = max(self._seen, head - layout.RECORDS // 2, 0)
-        cause = self._cause(first, head)
+        cause = self._cause(first, head, lost_clients)
         self._seen = head
         now = time.monotonic()
-        if cause is None or now - self._last_file_s.get(cause, -np.inf) < QUIET_S:
+        if (
+            cause is None
+            or now - self._last_file_s.get(cause, -np.inf) < QUIET_S
+            or self._files == MOST_FILES
+        ):
             return None
+        self._files += 1
+        if self._files == MOST_FILES:
+            log.warning("black box: %d files, no more are written until the next start", MOST_FILES)
         self._last_file_s[cause] = now
         thread = threading.Thread(target=self._write, args=(cause, head), name="black box", daemon=True)
         thread.start()
         return thread
 
-    def _cause(self, first: int, head: int) -> str | None:
-        if first == head:
-            return None
+    def _cause(self, first: int, head: int, lost_clients: int) -> str | None:
         flags = self._flags(first, head)
         if np.any(flags & int(Flags.FAULT)):
             return "fault"
+        was_lost, self._lost_clients = self._lost_clients > self._lost_written, lost_clients
+        if was_lost:  # seen the last time, so that by now the fading of the force is among the ticks
+            self._lost_written = self._lost_clients
+            return "lost"
+        if first == head:
+            return None
         before = self._flags(first - 1, head - 1) if first else np.full_like(flags, int(Flags.STALE))
         became_stale = (flags & int(Flags.STALE) > 0) & (before & int(Flags.DECAYING) > 0)
-        if np.any(became_stale):
+        if np.any(
+            became_stale & (self._column(layout.SEQUENCE, first, head) >= 0)
+        ):  # not one that was released
             return "stale"
         recent = self._flags(max(0, head - STORM_TICKS), head)
         if len(recent) == STORM_TICKS and np.mean(np.any(recent & _LIMITED, axis=1)) >= STORM_SHARE:
@@ -76,9 +92,12 @@ class BlackBox:
         return None
 
     def _flags(self, first: int, last: int) -> layout.Integers:
+        return self._column(layout.CONTACT_FLAGS, first, last)
+
+    def _column(self, column: int, first: int, last: int) -> layout.Integers:
         """(ticks, n_contacts)"""
         rows = np.arange(first, last) % layout.RECORDS
-        return self.memory.record_inputs[rows, :, layout.CONTACT_FLAGS]
+        return self.memory.record_inputs[rows, :, column]
 
     def _write(self, cause: str, head: int) -> None:
         ticks = np.arange(max(0, head - KEPT_TICKS), head)

@@ -27,6 +27,7 @@ from palpate_server.service import Service
 log = logging.getLogger("palpate_server")
 
 FADE_OVER_S = 0.5  # from one model to another
+MOST_DAMPING_N_S_PER_M = 100.0  # that passivity control may do without a device that says what it can
 _LONGEST_FILE_NAME = 255  # bytes, on the usual file systems
 
 
@@ -65,7 +66,9 @@ class Control:
             self._alive.add(client)
             return
         self._alive.discard(client)
-        for name in self._release(client):
+        released = self._release(client)
+        self._service.lost_clients += bool(released)
+        for name in released:
             log.info("client %s is gone: contact %s is free", client, name)
 
     def end_recording(self) -> None:
@@ -95,13 +98,15 @@ class Control:
         raise Refused("unknown_action", f"no control action is called {action!r}: there are {known}")
 
     def _acquire(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
-        contacts = request.get("contacts")
+        contacts = _needed(request, "contacts")
         if not isinstance(contacts, list) or not contacts or not all(isinstance(c, str) for c in contacts):
             raise wire.MalformedMessage("wrong_type", f"contacts is {contacts!r}: expected a list of names")
         try:
             frame = read_frame(request.get("frame"))
-        except ValueError as error:
+        except TypeError as error:
             raise wire.MalformedMessage("wrong_type", str(error)) from error
+        except ValueError as error:
+            raise Refused("out_of_range", str(error)) from error
         device = _device(request)
         if self._service.state != "running":
             raise Refused("stopping", "the server is stopping")
@@ -163,37 +168,49 @@ class Control:
         return list(dict.fromkeys(warnings))  # contacts are often alike
 
     def _set_limits(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
-        held = self._service.leases.held_by(client)
-        wanted = request.get("limits")
-        if not isinstance(wanted, dict) or not wanted:
+        leases = self._service.leases
+        wanted = _needed(request, "limits")
+        if not isinstance(wanted, dict):
             raise wire.MalformedMessage("wrong_type", f"limits is {wanted!r}: expected a map of numbers")
-        if not held:
-            raise Refused("not_holder", f"client {client!r} holds no contact")
         for field in wanted:
             if field not in Limits._fields:
-                raise Refused(
-                    "unknown_limit", f"no limit is called {field!r}: there are {', '.join(Limits._fields)}"
-                )
-            value, ceiling = _optional_number(wanted, field), getattr(self._service.limits, field)
-            if value is None:
-                raise wire.MalformedMessage("wrong_type", f"{field} is None: expected a number")
-            if field != "max_damping_n_s_per_m" and not 0 < value <= ceiling:
-                raise Refused("limit_too_high", f"{field} is {value}: expected above 0, at most {ceiling}")
-            # Of the server's largest force, not the client's own: one that was allowed before may still stand.
-            least = safety.least_force_rate(self._service.limits.max_force_n)
-            if field == "max_force_rate_n_per_s" and value < least:
-                raise Refused(
-                    "limit_too_low",
-                    f"{field} is {value}: expected at least {least:g}, so that a force can fade in time",
-                )
+                known = ", ".join(Limits._fields)
+                raise Refused("unknown_limit", f"no limit is called {field!r}: there are {known}")
+        numbers = {field: _number(wanted, field) for field in wanted}
+        held = leases.held_by(client)
+        if not held:
+            raise Refused("not_holder", f"client {client!r} holds no contact")
+        for name in held:  # for all of them or for none
+            self._check_limits(numbers, leases.terms[name].device)
         for name in held:
-            terms = self._service.leases.terms[name]
-            limits = terms.limits._replace(**wanted)
+            limits = leases.terms[name].limits._replace(**numbers)
             tick = self._service.between_ticks(
                 loop.set_limits, self._service.contact_index[name], np.array(limits)
             )
-            self._service.leases.terms[name] = replace(terms, limits=limits, since_tick=tick)
-        return {"contacts": list(held), "limits": limits._asdict()}
+            leases.terms[name] = replace(leases.terms[name], limits=limits, since_tick=tick)
+        return {
+            "contacts": list(held),
+            "limits": {name: leases.terms[name].limits._asdict() for name in held},
+        }
+
+    def _check_limits(self, wanted: dict[str, float], device: Device | None) -> None:
+        """Raises Refused for one that is beyond the server's, or the device's that renders."""
+        ceiling = self._service.limits._replace(max_damping_n_s_per_m=MOST_DAMPING_N_S_PER_M)
+        if device is not None:
+            ceiling = limits_for(device.profile, ceiling)
+        # Of the server's largest force, not the client's own: one that was allowed before may still stand.
+        least_rate = safety.least_force_rate(self._service.limits.max_force_n)
+        for field, value in wanted.items():
+            most = getattr(ceiling, field)
+            if field == "max_damping_n_s_per_m":
+                allowed, expected = 0 <= value <= most, f"0 to {most:g}"
+            elif field == "max_force_rate_n_per_s":
+                allowed = least_rate <= value <= most
+                expected = f"{least_rate:g} to {most:g}, so that a force can fade in time"
+            else:
+                allowed, expected = 0 < value <= most, f"above 0, at most {most:g}"
+            if not allowed:
+                raise Refused("out_of_range", f"{field} is {value:g}: expected {expected}")
 
     def _reset(self, client: str) -> dict[str, Any]:
         self._check_alone(client)
@@ -214,7 +231,7 @@ class Control:
             raise Refused("busy", "another model is being loaded")
         try:
             service = self._service
-            model = self._read_model(request.get("model"))
+            model = self._read_model(_needed(request, "model"))
             following = layout.make_model(model.discrete, service.memory.displacement.ravel().copy())
             step = model.period_s / FADE_OVER_S
             fading = service.memory._replace(next_model=following, fade=np.array([0.0, step]))
@@ -247,7 +264,7 @@ class Control:
         if len(os.fsencode(name)) > _LONGEST_FILE_NAME or "\0" in name:
             raise Refused(
                 "bad_model",
-                f"model is {name[:40]!r}...: expected a file's name of at most {_LONGEST_FILE_NAME} bytes",
+                f"model is {name[:40]!r}...: expected a file's name of at most {_LONGEST_FILE_NAME} bytes, none zero",
             )
         path = self._models / name
         try:
@@ -273,14 +290,13 @@ class Control:
         """Start or end a recording, whoever asks; it belongs to no client."""
         if self._recordings is None:
             raise Refused("no_recordings", "the server was started without a folder for recordings")
-        if "file" not in request:
-            raise wire.MalformedMessage("missing_field", "file is missing: expected a name, or null")
+        file = _needed(request, "file")
         if not self._recording.acquire(blocking=False):
             raise Refused("busy", "a recording is being started or ended")
         try:
-            if request["file"] is None:
+            if file is None:
                 return self._end_recording()
-            path = file_in(self._recordings, request["file"])
+            path = file_in(self._recordings, file)
             if self._service.state != "running":
                 raise Refused("stopping", "the server is stopping")
             if self._service.recorder is not None and self._service.recorder.error is None:
@@ -304,26 +320,42 @@ class Control:
     def _release(self, client: str) -> tuple[str, ...]:
         released = self._service.leases.release(client)
         self._service.forget_commands(released)
+        leases = self._service.leases
+        for name in released:  # what was agreed is over; the loop keeps to it until another holder comes
+            leases.terms[name] = replace(leases.terms[name], device=None)
         return released
 
 
 def _device(request: dict[str, Any]) -> Device | None:
     name = request.get("device")
+    round_trip_s = _optional_number(request, "round_trip_s")
+    damping = _optional_number(request, "device_damping_n_s_per_m")
     if name is None:
         return None
     if not (isinstance(name, str) and name in PROFILES):
         raise Refused("unknown_device", f"device is {name!r}: there are {', '.join(PROFILES)}")
-    return Device(
-        PROFILES[name],
-        _optional_number(request, "round_trip_s"),
-        _optional_number(request, "device_damping_n_s_per_m"),
-    )
+    return Device(PROFILES[name], round_trip_s, damping)
+
+
+def _needed(request: dict[str, Any], field: str) -> Any:
+    if field not in request:
+        raise wire.MalformedMessage("missing_field", f"{field} is missing")
+    return request[field]
+
+
+def _number(request: dict[str, Any], field: str) -> float:
+    value = request[field]
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise wire.MalformedMessage("wrong_type", f"{field} is {value!r}: expected a number")
+    if not abs(value) < math.inf:
+        raise Refused("out_of_range", f"{field} is {value!r}: expected a finite number")
+    return float(value)
 
 
 def _optional_number(request: dict[str, Any], field: str) -> float | None:
-    value = request.get(field)
-    if value is None:
+    if request.get(field) is None:
         return None
-    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value < math.inf:
-        raise wire.MalformedMessage("wrong_type", f"{field} is {value!r}: expected a number, at least 0")
-    return float(value)
+    value = _number(request, field)
+    if value < 0:
+        raise Refused("out_of_range", f"{field} is {value:g}: expected at least 0")
+    return value

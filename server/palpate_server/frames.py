@@ -41,29 +41,30 @@ IDENTITY = Frame()
 def read_frame(value: object) -> Frame:
     """A frame from a message's map; fields that are missing are those of the identity.
 
-    Raises ValueError naming the field, its value and what was expected.
+    Raises TypeError for what is no frame, ValueError for one that can't be; both name the field, its value and what was
+    expected.
     """
     if value is None:
         return IDENTITY
     if not isinstance(value, dict):
-        raise ValueError(f"frame is {value!r}: expected a map with rotation, scale, origin_m")
+        raise TypeError(f"frame is {value!r}: expected a map with rotation, scale, origin_m")
     unknown = set(value) - {"rotation", "scale", "origin_m"}
     if unknown:
-        raise ValueError(
+        raise TypeError(
             f"frame has {', '.join(sorted(map(str, unknown)))}: expected rotation, scale, origin_m"
         )
     rows = value.get("rotation", IDENTITY.rotation)
     if not (isinstance(rows, list | tuple) and len(rows) == 3):
-        raise ValueError(f"frame rotation is {rows!r}: expected 3 rows of 3 numbers")
+        raise TypeError(f"frame rotation is {rows!r}: expected 3 rows of 3 numbers")
     rotation = tuple(_three("rotation row", row) for row in rows)
     matrix = np.array(rotation)
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(matrix) < 0:
         raise ValueError(f"frame rotation is {rows!r}: expected an orthonormal, right-handed matrix")
     scale = value.get("scale", 1.0)
-    if not (_is_number(scale) and SMALLEST_SCALE <= scale <= LARGEST_SCALE):
-        raise ValueError(
-            f"frame scale is {scale!r}: expected a number from {SMALLEST_SCALE:g} to {LARGEST_SCALE:g}"
-        )
+    if not _is_number(scale):
+        raise TypeError(f"frame scale is {scale!r}: expected a number")
+    if not SMALLEST_SCALE <= scale <= LARGEST_SCALE:
+        raise ValueError(f"frame scale is {scale!r}: expected {SMALLEST_SCALE:g} to {LARGEST_SCALE:g}")
     origin = _three("origin_m", value.get("origin_m", (0.0, 0.0, 0.0)))
     if max(map(abs, origin)) > FARTHEST_ORIGIN_M:
         raise ValueError(
@@ -74,7 +75,7 @@ def read_frame(value: object) -> Frame:
 
 def _three(name: str, value: Any) -> tuple[float, float, float]:
     if not (isinstance(value, list | tuple) and len(value) == 3 and all(_is_number(v) for v in value)):
-        raise ValueError(f"frame {name} is {value!r}: expected 3 finite numbers")
+        raise TypeError(f"frame {name} is {value!r}: expected 3 finite numbers")
     x, y, z = value
     return float(x), float(y), float(z)
 

@@ -32,6 +32,7 @@ _COUNTERS = {
     "caught_up_ticks": "missed ticks that were made up for",
     "skipped_ticks": "missed ticks that were not",
     "faults": "forces that were not finite",
+    "lost_clients": "clients that were gone without releasing what they held",
     "accepted": "commands carried out",
 }
 _DURATIONS = ("timer_lateness_s", "tick_lateness_s", "compute_time_s", "input_age_s")

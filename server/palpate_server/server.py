@@ -260,7 +260,7 @@ class Server:
         if recorder is not None:
             recorder.status(payload)
         if self._black_box is not None:
-            self._black_box.examine()
+            self._black_box.examine(self.service.lost_clients)
 
     def _publish_surfaces(self) -> None:
         service = self.service

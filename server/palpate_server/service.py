@@ -26,6 +26,7 @@ class Service:
     state                   "running" or "stopping"; `stopping` is set when all threads are to end
     last_sequence           of the newest command of each contact
     undisturbed_since_tick  the last reset or change of model: until then a recording can be repeated
+    lost_clients            clients whose token went while they held a contact
     model_in_use            held while the surface is computed from the model, and while it is exchanged
     """
 
@@ -46,6 +47,7 @@ class Service:
         self.state = "running"
         self.stopping = threading.Event()
         self.undisturbed_since_tick = 0
+        self.lost_clients = 0
         self.recorder: Recorder | None = None
         self.model_in_use = threading.Lock()
         self._changing = threading.Lock()  # the loop has one slot for changes
@@ -81,6 +83,7 @@ class Service:
             self.messages,
             self.leases,
             self.undisturbed_since_tick,
+            self.lost_clients,
             None if self.recorder is None else self.recorder.report(),
         )
 

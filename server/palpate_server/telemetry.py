@@ -86,6 +86,7 @@ def status(
     messages: MessageCounters,
     leases: Leases,
     undisturbed_since_tick: int,
+    lost_clients: int,
     recording: dict[str, Any] | None,
 ) -> dict[str, Any]:
     """The status message; `state` is "running" or "stopping", `recording` what its recorder reports."""
@@ -108,6 +109,7 @@ def status(
         "caught_up_ticks": ticks[layout.CAUGHT_UP_TICKS],
         "skipped_ticks": ticks[layout.SKIPPED_TICKS],
         "faults": ticks[layout.FAULTS],
+        "lost_clients": lost_clients,
         **{
             name: percentiles(memory.histograms[row].copy(), int(memory.longest_ns[row]))
             for name, row in durations.items()

@@ -259,7 +259,11 @@ def test_old_sequences_and_others_contacts_are_refused(
         ("no.body/acquire", {"contacts": ["tip"]}, "wrong_type"),
         ("*/acquire", {"contacts": ["tip"]}, "wrong_type"),
         ("nobody/acquire", {"contacts": "tip"}, "wrong_type"),
-        ("nobody/acquire", None, "wrong_type"),
+        ("nobody/acquire", None, "missing_field"),
+        ("nobody/acquire", {"contacts": ["tip"], "frame": {"scale": 0}}, "out_of_range"),
+        ("nobody/acquire", {"contacts": ["tip"], "round_trip_s": -1}, "out_of_range"),
+        ("nobody/limits", {}, "missing_field"),
+        ("nobody/limits", {"limits": {"max_force_n": 1.0}}, "not_holder"),
         ("nobody/acquire", [1], "not_a_map"),
         ("nobody/acquire", {"contacts": ["tip"], "device": ["omega"]}, "unknown_device"),
         ("nobody/acquire", {"contacts": ["tip"], "device": {}}, "unknown_device"),
@@ -306,7 +310,7 @@ def test_a_device_brings_its_limits_its_frame_and_warnings(
         granted, refusal = client.control("acquire", request | {"device": "hammer"})
         assert (granted, refusal["reason"]) == (False, "unknown_device")
         granted, refusal = client.control("acquire", request | {"frame": {"scale": -1}})
-        assert (granted, refusal["reason"]) == (False, "wrong_type")
+        assert (granted, refusal["reason"]) == (False, "out_of_range")
         nothing = {"limits": {"max_damping_n_s_per_m": None}}
         granted, refusal = client.control("limits", nothing)
         assert (granted, refusal["reason"]) == (False, "wrong_type")
@@ -314,13 +318,22 @@ def test_a_device_brings_its_limits_its_frame_and_warnings(
         limits = {"limits": {"max_force_n": 1.5}}
         granted, answer = client.control("limits", limits)
         assert granted
-        assert answer["limits"] == terms["limits"] | {"max_force_n": 1.5}
-        granted, refusal = client.control("limits", limits | {"limits": {"max_force_n": 11.0}})
-        assert (granted, refusal["reason"]) == (False, "limit_too_high")
+        assert answer["limits"] == {"tip": terms["limits"] | {"max_force_n": 1.5}}
+        beyond: list[dict[str, float]] = [  # of the server's 10 N, or of the device's 3.3 N and 5 N s/m
+            {"max_force_n": 11.0},
+            {"max_force_n": 3.4},
+            {"max_damping_n_s_per_m": 5.1},
+            {"max_force_n": 0.0},
+            {"max_force_n": -1.0},
+            {"max_force_n": math.inf},
+        ]
+        for wanted in beyond:
+            granted, refusal = client.control("limits", {"limits": wanted})
+            assert (granted, refusal["reason"]) == (False, "out_of_range")
         for too_slow in (199.0, 1e-320):  # the server's 10 N in the 50 ms of the fading are 200 N/s
             slow = limits | {"limits": {"max_force_rate_n_per_s": too_slow}}
             granted, refusal = client.control("limits", slow)
-            assert (granted, refusal["reason"]) == (False, "limit_too_low")
+            assert (granted, refusal["reason"]) == (False, "out_of_range")
             assert "200" in refusal["message"]
         assert client.control("limits", limits | {"limits": {"max_force_rate_n_per_s": 200.0}})[0]
         granted, refusal = client.control("limits", limits | {"limits": {"max_torque": 1.0}})
@@ -589,9 +602,9 @@ def test_a_killed_client_leaves_a_black_box_behind(
         client = run_example("headless_client.py", served.endpoint, "--duration-s", "60")
         wait_until(lambda: observer.forces[-1]["force_scale"][0] == 1)
         client.kill()
-        wait_until(lambda: list(folder.glob("*-stale.npz")))
+        wait_until(lambda: list(folder.glob("*-lost.npz")))
     served.stop()
-    (path,) = folder.glob("*-stale.npz")
+    (path,) = folder.glob("*-lost.npz")
     with np.load(path, allow_pickle=False) as file:
         assert np.any(file["force_n"])
         assert not np.any(file["force_n"][-1])

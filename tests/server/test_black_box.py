@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from palpate.model import ReducedModel
-from palpate_server import layout, loop
+from palpate_server import black_box, layout, loop
 from palpate_server.black_box import BlackBox
 from palpate_server.image import make_image
-from palpate_server.safety import Limits
+from palpate_server.safety import HOLD_NS, Limits
 
 PERIOD_NS = 1_000_000
 
@@ -27,13 +27,14 @@ def run(memory: layout.Memory, ticks: int, depth_m: float, first: int = 0) -> No
         loop.tick_on_arrival(image, now)
 
 
-def silence(memory: layout.Memory, ticks: int) -> None:
+def silence(memory: layout.Memory, ticks: int, *, released: bool = False) -> None:
+    """Ticks after the client has fallen silent, or has released its contact."""
     image = make_image(memory)
-    loop.forget_command(memory.commands, 0)
-    for _ in range(ticks):
-        now = time.monotonic_ns()
-        memory.shared[layout.DEADLINE_NS] = now + PERIOD_NS // 4
-        loop.tick_on_arrival(image, now)
+    if released:
+        loop.forget_command(memory.commands, 0)
+    silent_ns = time.monotonic_ns() + (0 if released else HOLD_NS)
+    for i in range(1, ticks + 1):
+        loop.repeat_tick(image, silent_ns + i * PERIOD_NS)
 
 
 @pytest.fixture
@@ -47,6 +48,8 @@ def test_nothing_is_written_while_all_is_well(memory: layout.Memory, tmp_path: P
     silence(memory, 10)  # nobody has come yet: stale, but no event
     assert box.examine() is None
     run(memory, 1500, 1e-9)
+    assert box.examine() is None
+    silence(memory, 100, released=True)  # stale too, as it should be
     assert box.examine() is None
     assert list(tmp_path.iterdir()) == []
 
@@ -70,6 +73,22 @@ def test_a_stale_input_is_written_once_with_the_ticks_before_it(
     run(memory, 100, 1e-9, first=3000)
     silence(memory, 100)
     assert box.examine() is None  # too soon after the last one
+
+
+def test_a_lost_client_is_written_once_and_files_come_to_an_end(
+    memory: layout.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(black_box, "QUIET_S", 0.0)
+    box = BlackBox(tmp_path, "s", ["tip"], memory)
+    for lost in range(1, 111):
+        run(memory, 1, 1e-9, first=lost)
+        assert box.examine(lost) is None  # waits for the fading
+        writing = box.examine(lost)
+        assert (writing is None) == (lost > black_box.MOST_FILES)
+        assert box.examine(lost) is None
+        if writing is not None:
+            writing.join()
+    assert len(list(tmp_path.glob("*-lost.npz"))) == black_box.MOST_FILES
 
 
 def test_a_fault_and_a_storm_of_limits_are_named(memory: layout.Memory, tmp_path: Path) -> None:

@@ -44,25 +44,27 @@ def test_a_missing_field_is_that_of_the_identity() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "named"),
+    ("value", "named", "error"),
     [
-        ([], "frame"),
-        ({"rotate": 1}, "rotate"),
-        ({"scale": 0}, "scale"),
-        ({"scale": math.nan}, "scale"),
-        ({"scale": True}, "scale"),
-        ({"scale": 1e300}, "scale"),
-        ({"scale": 1e-9}, "scale"),
-        ({"origin_m": [1e308, 0, 0]}, "origin_m"),
-        ({"origin_m": [0, 0]}, "origin_m"),
-        ({"origin_m": [0, 0, math.inf]}, "origin_m"),
-        ({"rotation": [[1, 0, 0], [0, 1, 0]]}, "rotation"),
-        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation"),
-        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0.1, 1]]}, "rotation"),
-        ({"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "rotation"),
-        ({"rotation": "none"}, "rotation"),
+        ([], "frame", TypeError),
+        ({"rotate": 1}, "rotate", TypeError),
+        ({"scale": 0}, "scale", ValueError),
+        ({"scale": math.nan}, "scale", TypeError),
+        ({"scale": True}, "scale", TypeError),
+        ({"scale": 1e300}, "scale", ValueError),
+        ({"scale": 1e-9}, "scale", ValueError),
+        ({"origin_m": [1e308, 0, 0]}, "origin_m", ValueError),
+        ({"origin_m": [0, 0]}, "origin_m", TypeError),
+        ({"origin_m": [0, 0, math.inf]}, "origin_m", TypeError),
+        ({"rotation": [[1, 0, 0], [0, 1, 0]]}, "rotation", TypeError),
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation", ValueError),
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0.1, 1]]}, "rotation", ValueError),
+        ({"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "rotation", ValueError),
+        ({"rotation": "none"}, "rotation", TypeError),
     ],
 )
-def test_a_frame_that_is_none_is_refused_by_the_name_of_its_field(value: object, named: str) -> None:
-    with pytest.raises(ValueError, match=named):
+def test_a_frame_that_is_none_is_refused_by_the_name_of_its_field(
+    value: object, named: str, error: type[Exception]
+) -> None:
+    with pytest.raises(error, match=named):
         read_frame(value)
