@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import socket
+import ssl
 import subprocess
 import sys
 import time
@@ -16,6 +18,7 @@ from typing import Any
 import msgpack
 import pytest
 import zenoh
+from mcap.reader import make_reader
 
 from palpate.model import save_model
 from palpate_server import wire
@@ -58,12 +61,13 @@ def write_configurations(folder: Path, certificates: Path, server: str) -> None:
     folder.mkdir()
     (folder / "server.json5").write_text(rewrite(server))
     client = rewrite((EXAMPLE / "client.json5").read_text())
-    for name in ("operator", "observer", "second", "foreign", "expired", "self_signed"):
+    for name in ("operator", "observer", "recorder", "second", "foreign", "expired", "self_signed"):
         (folder / f"{name}.json5").write_text(client.replace("operator", name))
     lines = [line for line in client.splitlines() if "connect_private_key" not in line]
     nobody = "\n".join(line for line in lines if "connect_certificate" not in line)
     (folder / "nobody.json5").write_text(nobody.replace("enable_mtls: true", "enable_mtls: false"))
     (folder / "plain.json5").write_text(client.replace("tls/", "tcp/"))
+    (folder / "servers_own.json5").write_text(client.replace("operator", "server"))
     save_model(spring_mass_model(), folder / "model.npz")
 
 
@@ -221,7 +225,7 @@ def test_an_operator_moves_the_tool_and_feels_it(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("server")
-@pytest.mark.parametrize("who", ["nobody", "plain", "foreign", "expired", "self_signed"])
+@pytest.mark.parametrize("who", ["nobody", "plain", "foreign", "expired", "self_signed", "servers_own"])
 def test_without_a_certificate_of_our_authority_nothing_is_read_and_nothing_moved(
     folder: Path, who: str
 ) -> None:
@@ -236,7 +240,13 @@ def test_without_a_certificate_of_our_authority_nothing_is_read_and_nothing_move
 @pytest.mark.usefixtures("server")
 @pytest.mark.parametrize(
     ("certificate", "name"),
-    [("observer", "observer"), ("observer", "operator"), ("operator", "other")],
+    [
+        ("observer", "observer"),
+        ("observer", "operator"),
+        ("recorder", "recorder"),
+        ("recorder", "operator"),
+        ("operator", "other"),
+    ],
 )
 def test_who_is_no_operator_of_that_name_hears_forces_but_cannot_move_the_tool(
     folder: Path, certificate: str, name: str
@@ -257,6 +267,59 @@ def test_a_certificate_of_ours_with_an_unknown_name_hears_nothing(folder: Path) 
             assert stranger.acquire() == ""
         finally:
             stranger.session.close()
+
+
+def handshake(folder: Path, certificates: Path) -> None:
+    """With the server of a folder, by Python's own TLS. Raises ssl.SSLError."""
+    (endpoint,) = re.findall(r"tls/localhost:(\d+)", (folder / "server.json5").read_text())
+    context = ssl.create_default_context(cafile=certificates / "authority.pem")
+    context.load_cert_chain(certificates / "operator.pem", certificates / "operator.key")
+    with (
+        socket.create_connection(("localhost", int(endpoint)), timeout=10) as plain,
+        context.wrap_socket(plain, server_hostname="localhost"),
+    ):
+        pass
+
+
+@pytest.mark.usefixtures("server")
+def test_a_clients_certificate_is_not_taken_for_the_servers(folder: Path, certificates: Path) -> None:
+    handshake(folder, certificates)  # the real one
+
+    posing = certificates.with_name("posing")
+    server = (EXAMPLE / "server.json5").read_text()
+    write_configurations(posing, certificates, server.replace("/server.", "/observer."))
+    with serving(posing):
+        with pytest.raises(ssl.SSLCertVerificationError):
+            handshake(posing, certificates)
+        done = run_client(posing, "operator")
+    assert done.returncode == 2
+    assert not done.stdout  # it heard nothing, and rendered nothing
+    assert "nothing answers" in done.stderr
+
+
+@pytest.mark.usefixtures("server")
+def test_a_recorder_records_the_commands_of_an_operator(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "session.mcap"
+    options = (str(out), "--zenoh-config", str(folder / "recorder.json5"))
+    recorder = subprocess.Popen(
+        [sys.executable, "-m", "palpate_server.record", *options], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert recorder.stdout is not None
+        assert recorder.stdout.readline().startswith("recording")
+        time.sleep(0.5)  # until the server knows that it listens
+        done = run_client(folder, "operator")
+        assert done.returncode == 0, done.stderr
+        recorder.terminate()
+        assert recorder.wait(20) == 0
+    finally:
+        recorder.kill()
+        recorder.communicate()
+    with out.open("rb") as stream:
+        topics = [channel.topic for _, channel, _ in make_reader(stream).iter_messages()]
+    answered = json.loads(done.stdout)["commands_answered"]
+    assert answered > 0
+    assert topics.count(KEYS.command("operator")) >= answered // 2  # best effort, on a busy machine
 
 
 @pytest.mark.usefixtures("server")
