@@ -6,6 +6,7 @@ Needs `eclipse-zenoh` and `msgpack`. In another language the same few calls of z
 import argparse
 import json
 import math
+import re
 import threading
 import time
 import uuid
@@ -141,6 +142,14 @@ class Connection:
 
         self._forces = self.zenoh.declare_subscriber(f"{self.prefix}/force", receive)
 
+    def on_status(self, handle):
+        """Call `handle(message)` for every status, some ten times a second."""
+
+        def receive(sample):
+            handle(msgpack.unpackb(sample.payload.to_bytes()))
+
+        self._statuses = self.zenoh.declare_subscriber(f"{self.prefix}/status", receive)
+
 
 def _configuration(endpoint, zenoh_config):
     if zenoh_config:
@@ -160,6 +169,23 @@ def _configuration(endpoint, zenoh_config):
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def steps(duration_s, period_s):
+    """Give 0, 1, 2, ..., one each period. Deadlines count from the start, not from the last one: errors don't add up."""
+    start = time.monotonic()
+    for i in range(round(duration_s / period_s)):
+        wait = start + i * period_s - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
+        yield i
+
+
+def plain_name(text):
+    """A name of a client or a session from the command line: it becomes a part of keys."""
+    if not re.fullmatch("[A-Za-z0-9_-]{1,64}", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not 1 to 64 of A-Z a-z 0-9 _ -")
+    return text
 
 
 def positive(text):

@@ -5,6 +5,7 @@ import math
 
 SLACK = 1e-9  # of a newton: rounding
 REMEMBERED = 10_000  # commands: an answer to an older one would break the contract anyway
+GRACE_TICKS = 2  # for what may lie between a command's sending and the tick that it comes too late for
 
 
 class Contract:
@@ -18,6 +19,11 @@ class Contract:
         self.max_force_n = description["limits"]["max_force_n"]
         self.max_step_n = description["limits"]["max_force_rate_n_per_s"] * description["period_s"]
         self.hold_ns = (description["hold_s"] + description["period_s"]) * 1e9
+        # A client that is silent for so long is STALE.
+        self.fade_ns = (
+            description["hold_s"] + description["decay_s"] + GRACE_TICKS * description["period_s"]
+        ) * 1e9
+        self.holding = False  # the contact, as far as we know
         self.sent = {}  # sequence -> client_time_ns, the newest REMEMBERED ones
         self.commands = 0
         self.newest_answered = -1
@@ -28,13 +34,26 @@ class Contract:
         self.largest_force_n = 0.0
         self.broken = []
         self._last = None
+        self._newest_sent_ns = 0
+        self._sending_since_ns = 0  # without a pause that the server would notice
+        self._unheard = False
 
     def agree(self, terms):
-        """The answer to `acquire`: its limits are those that hold for us."""
+        """The answer to `acquire`: from now on we hold the contact, within these limits."""
         self.max_force_n = terms["limits"]["max_force_n"]
+        self.newest_answered = -1
+        self.holding = True
+
+    def release(self):
+        """Call it before the contact is given back, or acquired again: our commands are then forgotten rightly."""
+        self.holding = False
 
     def on_sent(self, command):
-        self.sent[command["sequence"]] = command["client_time_ns"]
+        now_ns = command["client_time_ns"]
+        if now_ns - self._newest_sent_ns > self.hold_ns:
+            self._sending_since_ns = now_ns
+        self._newest_sent_ns = now_ns
+        self.sent[command["sequence"]] = now_ns
         self.commands += 1
         self.sent.pop(command["sequence"] - REMEMBERED, None)
 
@@ -60,6 +79,17 @@ class Contract:
         if not silent and message["input_age_ns"][i] > self.hold_ns:
             self._break(tick, f"the input is {message['input_age_ns'][i] / 1e6} ms old and no flag says so")
 
+        if self.holding and sequence < 0 <= self.newest_answered:
+            # The server keeps a holder's last command, however silent the holder is.
+            self.holding = False
+            self._break(
+                tick,
+                "we no longer hold the contact, our commands are forgotten: it was released or taken back "
+                "(after a second of silence, for instance), or the server has stopped or was started again",
+            )
+            self._last = None  # another server counts its own ticks
+            return
+
         if self._last is not None:
             last_tick, last_sequence, last_force = self._last
             if tick <= last_tick:
@@ -68,17 +98,36 @@ class Contract:
             self.lost_ticks += tick - last_tick - 1
             if tick == last_tick + 1 and math.dist(force, last_force) > self.max_step_n + SLACK:
                 self._break(tick, f"the force jumped by {math.dist(force, last_force)} N in one tick")
-            if 0 <= sequence < last_sequence:
+            if self.holding and 0 <= sequence < last_sequence:
                 self._break(tick, f"it answers command {sequence}, the tick before answered {last_sequence}")
         self._last = tick, sequence, force
 
-        # An answer to one of our commands: before we hold the contact, others' (or nobody's, -1) are echoed.
-        if sequence >= 0 and self.sent:
-            if self.sent.get(sequence) != message["client_time_ns"][i]:
-                self._break(tick, f"it answers command {sequence}, which was not sent (or not at that time)")
-            elif sequence > self.newest_answered:
+        if self.sent.get(sequence) == message["client_time_ns"][i]:
+            if sequence > self.newest_answered:
                 self.newest_answered = sequence
                 self.round_trips_ns.append(arrival_ns - self.sent[sequence])
+            if self.holding:
+                self._check_heard(tick, sequence, message["input_age_ns"][i], flags & self.flags["STALE"])
+        elif self.holding and sequence >= 0:  # while we don't hold the contact, others' are answered
+            self._break(tick, f"it answers command {sequence}, which was not sent (or not at that time)")
+
+    def _check_heard(self, tick, sequence, age_ns, stale):
+        """A force that has faded is our own doing when we were silent, but not while we went on sending.
+
+        All times are on our clock: the tick began `age_ns` or more after its command was sent. When the message comes
+        says nothing: it may have waited while we were paused.
+        """
+        sent_ns = self.sent[sequence]
+        end_ns = min(sent_ns + age_ns, self._newest_sent_ns)
+        unheard_ns = end_ns - max(sent_ns, self._sending_since_ns)
+        unheard = bool(stale) and unheard_ns > self.fade_ns
+        if unheard and not self._unheard:
+            self._break(
+                tick,
+                f"the force has faded although we went on sending: for {unheard_ns / 1e6:.0f} ms no command of "
+                "ours has arrived, or they are refused",
+            )
+        self._unheard = unheard
 
     def _break(self, tick, what):
         if len(self.broken) < 20:  # one cause can break every tick; the first ones tell

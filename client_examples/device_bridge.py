@@ -2,17 +2,25 @@
 
 To use a real one, write a class like SimulatedDevice around its driver: `position` and `render` are all there is to it.
 
-Exit code 0: all well. 1: the contract was broken or the server went away. 2: it could not start.
+Whatever ends it, the device is left without a force. Exit code 0: all well. 1: the contract was broken, the contact was
+lost or the server went away; to go on, start it again: whoever holds the device then begins at rest. 2: it could not start.
+130: Ctrl-C or SIGTERM.
 """
 
 import argparse
 import math
+import signal
 import sys
 import time
 
 import zenoh
-from connection import Connection, Refused, ServerGone, positive
+from connection import Connection, Refused, ServerGone, plain_name, positive, steps
 from contract import Contract
+
+MEASURE_S = 1.0  # of round trips: a thousand
+FORCE_HOLD_S = (
+    0.02  # that a force is rendered for without a newer one: as long as the server holds a silent input
+)
 
 
 class SimulatedDevice:
@@ -40,6 +48,7 @@ class SimulatedDevice:
 
 def main():
     options = parse_options()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # like Ctrl-C
     zenoh.try_init_log_from_env()  # silent unless RUST_LOG says otherwise
     try:
         with Connection(options.connect, options.session, options.zenoh_config, options.name) as connection:
@@ -66,54 +75,72 @@ def run(connection, options):
         newest["heard"] = time.monotonic()
 
     connection.on_force(on_force)
-    # With a device the server watches the energy that goes through our hands, and damps what would build up.
+    device = SimulatedDevice(options.mass_kg, options.damping_n_s_per_m, options.hand_n_per_m)
+    contract.agree(connection.acquire([contact["name"]]))
+    round_trip_s = measure(connection, contract, contact)
+    if round_trip_s is None:
+        raise ServerGone("no command was answered")
+    # With a device the server watches the energy that goes through our hands, and damps what would build up. With its
+    # damping and the round trip the server can tell whether it might vibrate.
+    contract.release()
     terms = connection.acquire(
-        [contact["name"]], device=options.device, device_damping_n_s_per_m=options.damping_n_s_per_m
+        [contact["name"]],
+        device=options.device,
+        device_damping_n_s_per_m=options.damping_n_s_per_m,
+        round_trip_s=round_trip_s,
     )
     contract.agree(terms)
     for warning in terms["warnings"]:
         print(f"warning: {warning}", file=sys.stderr)
-    device = SimulatedDevice(options.mass_kg, options.damping_n_s_per_m, options.hand_n_per_m)
     period = connection.description["period_s"]
     deepest = 0.0
     trouble = None
+    let_go = False
     rendered = {}  # nothing is told before the first force is rendered
-    start = time.monotonic()
-    for i in range(round(options.duration_s / period)):
-        wait = start + i * period - time.monotonic()
-        if wait > 0:
-            time.sleep(wait)
-        # The tip is outside the tissue until its position is inside it; then it pushes, and nothing pulls it in.
-        depth = max(device.position_m, 0.0)
-        # The velocity lets the server carry the motion on when a command is late; the tick tells it which of its
-        # forces acted until now, so that it can count the energy exactly although messages take time.
-        speed = device.velocity_m_per_s if depth > 0 else 0.0
-        command = connection.command(
-            {contact["name"]: [depth * n for n in inwards]},
-            velocity_m_per_s={contact["name"]: [speed * n for n in inwards]},
-            **rendered,
-        )
-        contract.on_sent(command)  # before it is sent: the answer may come before `send` returns
-        connection.send(command)
-        # Never keep rendering what the server said long ago.
-        if connection.gone.is_set():
-            trouble = "the server is gone: its liveliness token was taken back"
-        elif time.monotonic() - newest["heard"] > options.silence_s:
-            trouble = f"the server is silent: no force for {options.silence_s} s"
-        if trouble:
-            device.render(0.0)
-            break
-        device.render(newest["force"] if depth > 0 else 0.0)
-        rendered = {} if newest["tick"] is None else {"rendered_tick": newest["tick"]}
-        device.move(options.reach_m * (1 - math.cos(2 * math.pi * i * period)) / 2, period)
-        deepest = max(deepest, device.position_m)
+    try:
+        for i in steps(options.duration_s, period):
+            # The tip is outside the tissue until its position is inside it; then it pushes, and nothing pulls it in.
+            depth = max(device.position_m, 0.0)
+            # The velocity lets the server carry the motion on when a command is late; the tick tells it which of its
+            # forces acted until now, so that it can count the energy exactly although messages take time.
+            speed = device.velocity_m_per_s if depth > 0 else 0.0
+            command = connection.command(
+                {contact["name"]: [depth * n for n in inwards]},
+                velocity_m_per_s={contact["name"]: [speed * n for n in inwards]},
+                **rendered,
+            )
+            contract.on_sent(command)  # before it is sent: the answer may come before `send` returns
+            connection.send(command)
+            # Never keep rendering what the server said long ago.
+            silence_s = time.monotonic() - newest["heard"]
+            if connection.gone.is_set():
+                trouble = "the server is gone: its liveliness token was taken back"
+            elif not contract.holding:
+                trouble = "the contact is no longer ours"
+            elif silence_s > options.silence_s:
+                trouble = f"the server is silent: no force for {options.silence_s} s"
+            if trouble:
+                break
+            # A force that was let go in the tissue would come back with a jump: it waits until the tip is outside.
+            let_go = silence_s > FORCE_HOLD_S or (let_go and depth > 0)
+            device.render(newest["force"] if depth > 0 and not let_go else 0.0)
+            rendered = {} if newest["tick"] is None else {"rendered_tick": newest["tick"]}
+            device.move(options.reach_m * (1 - math.cos(2 * math.pi * i * period)) / 2, period)
+            deepest = max(deepest, device.position_m)
+    finally:
+        device.render(0.0)  # or the motors would keep the last force, however this ends
     if not trouble:
-        time.sleep(0.05)
-        connection.release()
+        time.sleep(0.05)  # the last answers are still under way
+        contract.release()
+        try:
+            connection.release()
+        except ServerGone as error:
+            trouble = str(error)
 
     summary = contract.summary()
     trip = summary["round_trip_s"]["p50"]
     print(f"commands answered  {summary['commands_answered']} of {summary['commands_sent']}")
+    print(f"round trip told    {round_trip_s * 1e6:.0f} microseconds, before the device was moved")
     print(f"round trip p50     {'-' if trip is None else f'{trip * 1e6:.0f}'} microseconds")
     print(
         f"deepest position   {deepest * 1e3:.2f} mm of the {options.reach_m * 1e3:.2f} mm that the hand reached for"
@@ -126,6 +153,17 @@ def run(connection, options):
     return 1 if trouble or summary["contract_broken"] or not summary["commands_answered"] else 0
 
 
+def measure(connection, contract, contact):
+    """The round trip that 99 of 100 commands stay below, s: of commands that keep the tip at rest, rendering nothing."""
+    at_rest = {contact["name"]: [0.0, 0.0, 0.0]}
+    for _ in steps(MEASURE_S, connection.description["period_s"]):
+        command = connection.command(at_rest)
+        contract.on_sent(command)
+        connection.send(command)
+    time.sleep(0.05)  # the last answers are still under way
+    return contract.summary()["round_trip_s"]["p99"]
+
+
 def parse_options():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
@@ -134,12 +172,16 @@ def parse_options():
         metavar="ENDPOINT",
         help="where the server listens (%(default)s)",
     )
-    parser.add_argument("--session", default="main", help="the server's --session (%(default)s)")
+    parser.add_argument(
+        "--session", type=plain_name, default="main", help="the server's --session (%(default)s)"
+    )
     parser.add_argument(
         "--zenoh-config", metavar="FILE", help="Zenoh configuration to use instead of --connect"
     )
     parser.add_argument(
-        "--name", help="this client's; under access control, that in its certificate (default: a random one)"
+        "--name",
+        type=plain_name,
+        help="this client's; under access control, that in its certificate (default: a random one)",
     )
     parser.add_argument("--device", default="generic", help="profile whose limits are to hold (%(default)s)")
     parser.add_argument("--mass-kg", type=positive, default=0.1, help="of the handle (%(default)s)")

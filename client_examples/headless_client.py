@@ -1,6 +1,7 @@
 """Poke a served model without a device: drive one contact, check every force, print what it was like.
 
-Exit code 0: all well. 1: the contract was broken or the server went away. 2: it could not start. 130: Ctrl-C.
+Exit code 0: all well. 1: the contract was broken, the contact was lost or the server went away. 2: it could not start.
+3: the file of --record could not be written. 130: Ctrl-C.
 """
 
 import argparse
@@ -14,8 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import zenoh
-from connection import Connection, Refused, ServerGone, positive
+from connection import Connection, Refused, ServerGone, plain_name, positive, steps
 from contract import Contract
+
+STATUS_WAIT_S = 1.0  # statuses come ten times a second
 
 
 def main():
@@ -27,6 +30,8 @@ def main():
     except (Refused, ServerGone, OSError) as error:
         print(f"palpate client: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:  # before anything was moved
+        return 130
 
 
 def run(connection, options):
@@ -43,8 +48,11 @@ def run(connection, options):
         if options.record:
             recording.append(message)
 
+    statuses = Statuses()
     connection.on_force(on_force)
+    connection.on_status(statuses.receive)
     contract.agree(connection.acquire([contact["name"]]))
+    before = statuses.next()
     interrupted = False
     try:
         lost = drive(connection, contract, contact, motion(options), options, last_force)
@@ -52,25 +60,72 @@ def run(connection, options):
         lost, interrupted = None, True
     if not lost:
         time.sleep(0.05)  # the last answers are still under way
-        connection.release()
-        contract_holds = not contract.broken
-    else:
-        contract_holds = False
+        contract.release()
+        try:
+            connection.release()
+        except ServerGone as error:
+            lost = str(error)
+    after = statuses.newest if lost else statuses.next()
 
-    summary = contract.summary() | {"contact": contact["name"], "server_lost": lost}
+    summary = contract.summary() | {
+        "contact": contact["name"],
+        "server_lost": lost,
+        "not_carried_out": not_carried_out(before, after),
+    }
     if not summary["commands_answered"] and not lost:
         summary["contract_broken"].append("no command was answered")
-        contract_holds = False
-    if options.record:
-        write_recording(options.record, connection.description, recording)
-    print(json.dumps(summary) if options.json else readable(summary))
+    print(json.dumps(summary) if options.json else readable(summary), flush=True)
     for line in summary["contract_broken"]:
         print(f"contract broken: {line}", file=sys.stderr)
     if lost:
         print(f"palpate client: {lost}", file=sys.stderr)
+    unwritten = None
+    if options.record:
+        try:
+            write_recording(options.record, connection.description, recording)
+        except OSError as error:
+            unwritten = error
+            print(f"palpate client: {options.record}: {error.strerror}", file=sys.stderr)
     if interrupted:
         return 130
-    return 0 if contract_holds else 1
+    if lost or summary["contract_broken"]:
+        return 1
+    return 3 if unwritten else 0
+
+
+class Statuses:
+    """The server's statuses, of which only the newest counts."""
+
+    def __init__(self):
+        self.newest = None
+        self._came = threading.Event()
+
+    def receive(self, status):
+        self.newest = status
+        self._came.set()
+
+    def next(self):
+        """One that comes from now on, or the newest when none does."""
+        self._came.clear()
+        self._came.wait(STATUS_WAIT_S)
+        return self.newest
+
+
+def not_carried_out(before, after):
+    """What the server counted between two statuses, of all its clients' commands; None without both statuses."""
+    if before is None or after is None:
+        return None
+    counters = {
+        **{f"refused {reason}": "refused" for reason in after["refused"]},
+        **{f"malformed {reason}": "malformed" for reason in after["malformed"]},
+        "superseded": "dropped",
+    }
+    counts = {}
+    for name, kind in counters.items():
+        reason = name.rpartition(" ")[2]
+        if count := after[kind][reason] - before[kind][reason]:
+            counts[name] = count
+    return counts
 
 
 def choose_contact(description, name):
@@ -95,13 +150,8 @@ def drive(connection, contract, contact, depth, options, last_force):
     """Send a command each period until the duration is over; what was lost when the server goes away, else None."""
     inwards = [-n for n in contact["normal"]]
     period = 1 / options.rate_hz
-    start = time.monotonic()
-    heard = start
-    for i in range(round(options.duration_s * options.rate_hz)):
-        # Deadlines from the start, not from the last one: errors don't add up.
-        wait = start + i * period - time.monotonic()
-        if wait > 0:
-            time.sleep(wait)
+    heard = time.monotonic()
+    for i in steps(options.duration_s, period):
         depth_m, speed_m_per_s = depth(i * period)
         # With the velocity the server carries the motion on when a command is late, instead of holding and jumping.
         command = connection.command(
@@ -112,6 +162,8 @@ def drive(connection, contract, contact, depth, options, last_force):
         connection.send(command)
         if connection.gone.is_set():
             return "the server is gone: its liveliness token was taken back"
+        if not contract.holding:
+            return None  # nobody would hear us; the contract says why
         if last_force.is_set():
             last_force.clear()
             heard = time.monotonic()
@@ -143,18 +195,23 @@ def readable(summary):
     def microseconds(seconds):
         return "-" if seconds is None else f"{seconds * 1e6:.0f}"
 
+    def listed(counts):
+        return ", ".join(f"{name} {count}" for name, count in counts.items()) or "none"
+
     trip = summary["round_trip_s"]
-    flags = ", ".join(f"{name} {count}" for name, count in summary["flags"].items()) or "none"
+    not_done = summary["not_carried_out"]
     return "\n".join(
         (
             f"contact            {summary['contact']}",
             f"commands           {summary['commands_sent']} sent, {summary['commands_answered']} answered, "
-            f"{summary['commands_unanswered']} not (a newer one was used instead)",
+            f"{summary['commands_unanswered']} not",
+            f"not carried out    {'unknown' if not_done is None else listed(not_done)} (by the server's count, of all "
+            "clients' commands)",
             f"forces             {summary['forces_received']} received, {summary['forces_lost']} lost",
             f"round trip         p50 {microseconds(trip['p50'])}, p99 {microseconds(trip['p99'])}, "
             f"p99.9 {microseconds(trip['p99_9'])}, longest {microseconds(trip['max'])} microseconds",
             f"largest force      {summary['largest_force_n']:.4g} N",
-            f"flags (ticks)      {flags}",
+            f"flags (ticks)      {listed(summary['flags'])}",
             f"contract           {'BROKEN' if summary['contract_broken'] else 'held'}",
         )
     )
@@ -168,12 +225,16 @@ def parse_options():
         metavar="ENDPOINT",
         help="where the server listens (%(default)s)",
     )
-    parser.add_argument("--session", default="main", help="the server's --session (%(default)s)")
+    parser.add_argument(
+        "--session", type=plain_name, default="main", help="the server's --session (%(default)s)"
+    )
     parser.add_argument(
         "--zenoh-config", metavar="FILE", help="Zenoh configuration to use instead of --connect"
     )
     parser.add_argument(
-        "--name", help="this client's; under access control, that in its certificate (default: a random one)"
+        "--name",
+        type=plain_name,
+        help="this client's; under access control, that in its certificate (default: a random one)",
     )
     parser.add_argument("--contact", help="name of the contact to move (default: the model's first)")
     parser.add_argument(

@@ -9,7 +9,7 @@ import threading
 
 import msgpack
 import zenoh
-from connection import Connection, Refused, ServerGone
+from connection import Connection, Refused, ServerGone, plain_name
 
 PATIENCE_S = 2.0  # status comes ten times a second
 
@@ -48,7 +48,9 @@ def look(connection):
 def parse_options():
     parser = argparse.ArgumentParser(prog="palpate health", description=__doc__.splitlines()[0])
     parser.add_argument("--connect", default="tcp/127.0.0.1:7447", metavar="ENDPOINT", help="(%(default)s)")
-    parser.add_argument("--session", default="main", help="the server's --session (%(default)s)")
+    parser.add_argument(
+        "--session", type=plain_name, default="main", help="the server's --session (%(default)s)"
+    )
     parser.add_argument(
         "--zenoh-config", metavar="FILE", help="Zenoh configuration to use instead of --connect"
     )
