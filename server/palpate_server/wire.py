@@ -45,6 +45,25 @@ class MalformedMessage(ValueError):
 MALFORMED = ("too_large", "not_msgpack", "not_a_map", "missing_field", "wrong_type", "wrong_shape")
 DROPPED = ("superseded", "unsent_force")
 REFUSED = ("not_finite", "out_of_range", "unknown_contact", "not_holder", "old_sequence", "stopping")
+# Why a query that could be read is not granted.
+NOT_GRANTED = (
+    "out_of_range",
+    "unknown_action",
+    "unknown_contact",
+    "unknown_device",
+    "unknown_limit",
+    "not_alive",
+    "held",
+    "not_holder",
+    "busy",
+    "stopping",
+    "bad_model",
+    "no_recordings",
+    "bad_file",
+    "exists",
+    "not_recording",
+    "internal",
+)
 
 
 @dataclass(frozen=True)

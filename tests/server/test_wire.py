@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import ast
+import json
 import math
 import re
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import msgpack
 import numpy as np
 import pytest
+import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_server import wire
-from palpate_server.safety import Flags
+from palpate.model import ReducedModel
+from palpate_server import transport, wire
+from palpate_server.recorder import Recorder
+from palpate_server.safety import Flags, Limits
+from palpate_server.service import Service
 
 PAGE = Path(__file__).parents[2] / "docs" / "wire.md"
 GOOD = {"sequence": 3, "client_time_ns": 5, "displacement_m": {"tip": [0.0, 1e-3, -2]}}
@@ -153,11 +160,28 @@ def test_surface_displacements_are_little_endian_float32() -> None:
     np.testing.assert_array_equal(np.frombuffer(message["displacement_m"], "<f4"), displacement)
 
 
-def _table(heading: str) -> list[list[str]]:
-    """Rows of the first table below a heading of the page, without its two header lines."""
-    below = PAGE.read_text().split(f"\n## {heading}\n")[1].split("\n## ")[0]
-    rows = [line.strip("|").split("|") for line in below.splitlines() if line.startswith("|")]
-    return [[cell.strip() for cell in row] for row in rows[2:]]
+def _table(heading: str, number: int = 0) -> list[list[str]]:
+    """Rows of a table below a heading of the page, the first one unless told otherwise, without its two header lines."""
+    below = re.split(rf"^#+ {heading}$", PAGE.read_text(), flags=re.MULTILINE)[1].split("\n#")[0]
+    table = re.findall(r"(?:^\|.*\n?)+", below, re.MULTILINE)[number]
+    cells = [line.strip("|").split("|") for line in table.splitlines()]
+    return [[cell.strip() for cell in row] for row in cells[2:]]
+
+
+def _names(text: str) -> list[str]:
+    """What is set as code."""
+    return re.findall(r"`(\w+)`", text)
+
+
+def _fields(heading: str, number: int = 0) -> list[str]:
+    """All names in the first column of a table."""
+    return [name for row in _table(heading, number) for name in _names(row[0])]
+
+
+def _meaning(heading: str, field: str) -> list[str]:
+    """The names in what a table says of a field."""
+    (row,) = (row for row in _table(heading) if field in _names(row[0]))
+    return _names(row[1])
 
 
 def test_the_page_lists_exactly_the_flags_of_the_code() -> None:
@@ -166,9 +190,91 @@ def test_the_page_lists_exactly_the_flags_of_the_code() -> None:
 
 
 def test_the_page_lists_exactly_the_reasons_of_the_code() -> None:
-    rows = {row[0]: set(re.findall(r"`(\w+)`", row[1])) for row in _table("Counters")}
-    assert rows["`malformed`"] == set(wire.MALFORMED)
-    assert rows["`refused`"] == set(wire.REFUSED)
+    assert _fields("Counters") == ["refused", "malformed", "dropped"]
+    assert set(_meaning("Counters", "malformed")) == set(wire.MALFORMED)
+    assert set(_meaning("Counters", "refused")) == set(wire.REFUSED)
+    assert set(_meaning("Counters", "dropped")) == set(wire.DROPPED)
+
+
+def _calls(file: str) -> list[ast.Call]:
+    tree = ast.parse((Path(wire.__file__).parent / file).read_text())
+    return [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+
+
+def _texts(nodes: Iterable[ast.expr]) -> set[str]:
+    return {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+
+
+def _named(node: ast.expr, name: str) -> bool:
+    return isinstance(node, ast.Name) and node.id == name
+
+
+def test_the_page_lists_exactly_the_reasons_for_which_a_query_is_refused() -> None:
+    raised: set[str] = set()
+    for file in ("control.py", "leases.py", "recorder.py", "service.py"):
+        raised |= _texts(call.args[0] for call in _calls(file) if _named(call.func, "Refused"))
+    raised |= _texts(call.args[1] for call in _calls("server.py") if _named(call.func, "_refuse"))
+    assert raised == set(wire.NOT_GRANTED)
+    assert set(_fields("Control", 1)) == raised | set(wire.MALFORMED)
+
+
+def test_the_page_lists_exactly_the_fields_that_control_requests_have() -> None:
+    read: set[str] = set()
+    for call in _calls("control.py"):
+        is_get = isinstance(call.func, ast.Attribute) and _named(call.func.value, "request")
+        if is_get or (call.args and _named(call.args[0], "request")):
+            read |= _texts(call.args)
+    assert read
+    written = [name for row in _table("Control") for name in _names(row[1])]
+    assert sorted(written) == sorted(read)
+
+
+@pytest.fixture
+def service(make_spring_mass_model: Callable[..., ReducedModel]) -> Service:
+    limits = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
+    return Service(make_spring_mass_model(2, 4), limits, wire.Keys("test"), 1 / 30)
+
+
+def test_the_page_lists_exactly_the_fields_of_a_status(service: Service) -> None:
+    status = service.status()
+    assert sorted(_fields("Status")) == sorted(status)
+    assert set(_meaning("Status", "model")) == status["model"].keys()
+    assert set(_meaning("Status", "compute_time_s")) == status["compute_time_s"].keys()
+    assert _fields("Status of a contact") == list(status["contacts"]["tip"])
+
+
+def test_the_page_lists_exactly_the_fields_of_a_recordings_report(tmp_path: Path, service: Service) -> None:
+    recorder = Recorder(tmp_path / "a.mcap", service.keys, service.describe(), service.memory)
+    recorder.stop()
+    assert set(_meaning("Status", "recording")) - {"record"} == recorder.report().keys()
+
+
+def test_the_page_lists_exactly_the_fields_of_a_description(service: Service) -> None:
+    described = service.describe()
+    assert _fields("Describe") == list(described)
+    assert _meaning("Describe", "contacts") == list(described["contacts"][0])
+    assert _meaning("Describe", "limits") == list(described["limits"])
+    assert _meaning("Describe", "devices") == list(next(iter(described["devices"].values())))
+    assert set(_meaning("Describe", "model")) <= described["model"].keys()
+
+
+def test_the_page_lists_exactly_the_fields_of_geometry_and_surface() -> None:
+    geometry = msgpack.unpackb(wire.encode_geometry(np.zeros((1, 3)), np.zeros((1, 3), np.int32)))
+    assert _fields("Geometry") == list(geometry)
+    assert _fields("Surface") == list(msgpack.unpackb(wire.encode_surface(0, 0, np.zeros(3, np.float32))))
+
+
+def test_the_settings_on_the_page_are_a_configuration_for_a_client() -> None:
+    (block,) = re.findall(r"```json5\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    config = zenoh.Config.from_json5(block)
+    expected = {
+        "mode": "client",
+        "connect/endpoints": [transport.DEFAULT_ENDPOINT],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/link/tx/lease": transport.LEASE_MS,
+    }
+    assert {key: json.loads(config.get_json(key)) for key in expected} == expected
 
 
 def test_the_page_lists_the_keys_of_the_code() -> None:
@@ -206,3 +312,5 @@ def test_the_page_names_the_schema_version_the_encoding_and_the_size_limit() -> 
     assert f"schema version {wire.SCHEMA_VERSION}" in text
     assert wire.ENCODING in text
     assert f"{wire.MAX_COMMAND_BYTES} bytes" in text
+    assert f"{wire.MAX_REQUEST_BYTES} bytes" in text
+    assert f"{transport.MAX_MESSAGE_BYTES} bytes" in text
