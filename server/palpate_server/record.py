@@ -3,8 +3,8 @@
     palpate record OUT.mcap [--connect ENDPOINT] [--session NAME] [--duration-s S]
 
 A process of its own: a slow disk can't disturb the loop. OUT.mcap must be a new file. What follows a rest can be replayed:
-start it before the first command. Forces and commands are best effort, so that some may be missing, and where access
-control lets nobody but the server hear commands, all of these; a recording that the server makes of itself
+start it before the first command. Forces and commands are best effort, so that some may be missing, and all commands where
+access control does not let this client hear them (it says so); a recording that the server makes of itself
 (`palpate serve --recordings FOLDER`) has everything. SIGINT or SIGTERM ends it and leaves a complete file; after a full
 disk (exit code 1) what was written until then can still be read.
 """
@@ -168,8 +168,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _say_that_no_commands_are_heard() -> None:
     print(
-        "palpate record: the forces answer commands that are not heard here: access control lets nobody but the server "
-        "hear them? A recording that the server makes has them (palpate serve --recordings)",
+        "palpate record: the forces answer commands that are not heard here. Access control may allow them to a "
+        "recorder's certificate alone; a recording that the server makes has them (palpate serve --recordings)",
         file=sys.stderr,
         flush=True,
     )
