@@ -99,18 +99,6 @@ def run(connection, options):
     rendered = {}  # nothing is told before the first force is rendered
     try:
         for i in steps(options.duration_s, period):
-            # The tip is outside the tissue until its position is inside it; then it pushes, and nothing pulls it in.
-            depth = max(device.position_m, 0.0)
-            # The velocity lets the server carry the motion on when a command is late; the tick tells it which of its
-            # forces acted until now, so that it can count the energy exactly although messages take time.
-            speed = device.velocity_m_per_s if depth > 0 else 0.0
-            command = connection.command(
-                {contact["name"]: [depth * n for n in inwards]},
-                velocity_m_per_s={contact["name"]: [speed * n for n in inwards]},
-                **rendered,
-            )
-            contract.on_sent(command)  # before it is sent: the answer may come before `send` returns
-            connection.send(command)
             # Never keep rendering what the server said long ago.
             silence_s = time.monotonic() - newest["heard"]
             if connection.gone.is_set():
@@ -121,9 +109,21 @@ def run(connection, options):
                 trouble = f"the server is silent: no force for {options.silence_s} s"
             if trouble:
                 break
-            # A force that was let go in the tissue would come back with a jump: it waits until the tip is outside.
-            let_go = silence_s > FORCE_HOLD_S or (let_go and depth > 0)
-            device.render(newest["force"] if depth > 0 and not let_go else 0.0)
+            # A force that comes back in the tissue would jump: once let go, the tip stays out until the hand is out.
+            let_go = silence_s > FORCE_HOLD_S or (let_go and device.position_m > 0)
+            # The tip is outside the tissue until its position is inside it; then it pushes, and nothing pulls it in.
+            depth = 0.0 if let_go else max(device.position_m, 0.0)
+            # The velocity lets the server carry the motion on when a command is late; the tick tells it which of its
+            # forces acted until now, so that it can count the energy exactly although messages take time.
+            speed = device.velocity_m_per_s if depth > 0 else 0.0
+            command = connection.command(
+                {contact["name"]: [depth * n for n in inwards]},
+                velocity_m_per_s={contact["name"]: [speed * n for n in inwards]},
+                **rendered,
+            )
+            contract.on_sent(command)  # before it is sent: the answer may come before `send` returns
+            connection.send(command)
+            device.render(newest["force"] if depth > 0 else 0.0)
             rendered = {} if newest["tick"] is None else {"rendered_tick": newest["tick"]}
             device.move(options.reach_m * (1 - math.cos(2 * math.pi * i * period)) / 2, period)
             deepest = max(deepest, device.position_m)

@@ -23,7 +23,7 @@ EXAMPLES = Path(__file__).parents[2] / "client_examples"
 MS = 1_000_000
 FADE_MS = (HOLD_NS + DECAY_NS) // MS
 
-# The bridge as it is, with a driver whose motors write down each force that they are given.
+# The bridge as it is, with a driver whose motors write down where they are and each force that they are given.
 SPIED_BRIDGE = f"""
 import sys
 sys.path.insert(0, {str(EXAMPLES)!r})
@@ -31,7 +31,7 @@ import device_bridge
 forces = open(sys.argv.pop(1), "w", buffering=1)
 render = device_bridge.SimulatedDevice.render
 def spied(device, force_n):
-    print(force_n, file=forces)
+    print(device.position_m, force_n, file=forces)
     render(device, force_n)
 device_bridge.SimulatedDevice.render = spied
 sys.exit(device_bridge.main())
@@ -240,7 +240,13 @@ def run_bridge(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]
 
 
 def rendered(tmp_path: Path) -> list[float]:
-    return [float(line) for line in (tmp_path / "rendered").read_text().splitlines()]
+    return [force for _, force in positions_and_forces(tmp_path)]
+
+
+def positions_and_forces(tmp_path: Path) -> list[tuple[float, float]]:
+    lines = (tmp_path / "rendered").read_text().splitlines(keepends=True)
+    pairs = [line.split() for line in lines if line.endswith("\n")]
+    return [(float(position), float(force)) for position, force in pairs]
 
 
 def wait_for_a_force(tmp_path: Path) -> None:
@@ -298,7 +304,7 @@ def test_the_motors_are_left_without_a_force_when_the_contact_is_lost(
     assert rendered(tmp_path)[-1] == 0
 
 
-def test_while_no_force_comes_none_is_rendered(
+def test_while_no_force_comes_none_is_rendered_until_the_tip_has_left_the_tissue(
     serve: Callable[..., Any], run_bridge: Callable[..., Any], tmp_path: Path
 ) -> None:
     served = serve()
@@ -308,9 +314,14 @@ def test_while_no_force_comes_none_is_rendered(
     try:
         # Its token is there for another second: it is the silence that is noticed, after 20 ms.
         wait_until(lambda: rendered(tmp_path)[-1] == 0, 0.5)
-        assert bridge.poll() is None
+        let_go = len(rendered(tmp_path)) - 1
     finally:
         served.process.send_signal(signal.SIGCONT)
+    wait_until(lambda: any(rendered(tmp_path)[let_go:]))
+    assert bridge.poll() is None
+    positions, forces = zip(*positions_and_forces(tmp_path)[let_go:], strict=True)
+    assert positions[0] > 0
+    assert min(positions[: next(i for i, force in enumerate(forces) if force)]) <= 0
 
 
 def test_the_servers_warning_of_vibration_counts_the_round_trip_that_the_bridge_measured(
