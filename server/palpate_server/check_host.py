@@ -172,10 +172,12 @@ def timer(seconds: float = _TIMER_S) -> Finding:
 
     thread = threading.Thread(target=run)
     thread.start()
-    time.sleep(seconds)
-    loop.stop(memory.shared)
-    thread.join()
-    os.close(wake)
+    try:
+        time.sleep(seconds)
+    finally:
+        loop.stop(memory.shared)
+        thread.join()
+        os.close(wake)
     lateness = telemetry.percentiles(
         memory.histograms[layout.TIMER_LATENESS], int(memory.longest_ns[layout.TIMER_LATENESS])
     )
@@ -239,6 +241,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         measured = [timer(), *transport_round_trip(), *tick_run(options.seconds)]
     except transport.TransportError as error:
         print(f"palpate check-host: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
         return 2
     verdict = worst([finding.verdict for finding in measured])
     if options.json:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 
 import pytest
 
@@ -66,3 +67,13 @@ def test_a_check_ends_with_a_verdict_and_says_what_it_measured(capsys: pytest.Ca
         if finding["name"] in measured:
             assert finding["values"].keys() == measured[finding["name"]]
             assert all(type(value) is float for value in finding["values"].values())
+
+
+def test_ctrl_c_ends_a_check_and_the_threads_it_has_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    before = threading.active_count()
+    monkeypatch.setattr(check_host.time, "sleep", interrupted)
+    assert check_host.main([]) == 2
+    assert threading.active_count() == before
