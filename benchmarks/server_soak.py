@@ -56,7 +56,8 @@ def main() -> None:
             [sys.executable, __file__, str(path), "--serve", endpoint, str(out)],
             stdout=subprocess.PIPE,
             text=True,
-            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},  # as `palpate serve` does: a pool of them would spin
+            env=os.environ
+            | {"OPENBLAS_NUM_THREADS": "1"},  # as `palpate serve` does: a pool of them would spin
         )
         try:
             assert server.stdout is not None

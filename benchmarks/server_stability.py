@@ -84,7 +84,7 @@ def swing(model: ReducedModel, mass: float, damping: float, delay: int, controll
         depth = max(position, 0.0)  # outside, the tip does not touch
         told = k - delay - 1 if k > delay else -1
         target = tuple(float(v) for v in depth * inwards)
-        loop.write_command(memory.commands, 0, k, 0, now, told, target, (0.0, 0.0, 0.0))
+        loop.write_command(memory.commands, 0, k, 0, now, told, 0, target, (0.0, 0.0, 0.0))
         loop.tick_on_arrival(image, now)
         rendered.append(float(memory.device_force[0] @ inwards))
         force = rendered.pop(0) if depth > 0 else 0.0 * rendered.pop(0)

@@ -71,7 +71,7 @@ def run_ticks(n, commands, image, start, period):
         now = start + k * period
         for contact in range(commands.versions.size):
             depth = 1e-3 * (k % 64)
-            loop.write_command(commands, contact, k, 1, now, -1, (0.0, 0.0, depth), (0.0, 0.0, 0.0))
+            loop.write_command(commands, contact, k, 1, now, -1, 0, (0.0, 0.0, depth), (0.0, 0.0, 0.0))
         loop.repeat_tick(image, now)
 
 

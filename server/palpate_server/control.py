@@ -27,6 +27,7 @@ from palpate_server.service import Service
 log = logging.getLogger("palpate_server")
 
 FADE_OVER_S = 0.5  # from one model to another
+LEAST_SPEED_M_PER_S = 0.01
 MOST_DAMPING_N_S_PER_M = 100.0  # that passivity control may do without a device that says what it can
 _LONGEST_FILE_NAME = 255  # bytes, on the usual file systems
 
@@ -55,9 +56,7 @@ class Control:
         self._recordings = recordings
         self._alive: set[str] = set()  # clients whose liveliness token is known
         self._loading = threading.Lock()
-        self._handed_over: list[
-            layout.Memory
-        ] = []  # what the loop may run on, whatever becomes of an exchange
+        self._handed_over: tuple[layout.Memory, ...] = ()  # what the loop may run on, also at the very end
         self._recording = threading.Lock()  # is being started or ended
 
     def on_client(self, client: str, alive: bool) -> None:
@@ -101,6 +100,8 @@ class Control:
         contacts = _needed(request, "contacts")
         if not isinstance(contacts, list) or not contacts or not all(isinstance(c, str) for c in contacts):
             raise wire.MalformedMessage("wrong_type", f"contacts is {contacts!r}: expected a list of names")
+        if len(set(contacts)) < len(contacts):
+            raise wire.MalformedMessage("wrong_shape", "contacts names one of them twice")
         try:
             frame = read_frame(request.get("frame"))
         except TypeError as error:
@@ -114,11 +115,15 @@ class Control:
         self._service.leases.check(client, contacts)
 
         limits = self._service.limits if device is None else limits_for(device.profile, self._service.limits)
-        self._silence(contacts)
-        for name in contacts:
-            self._service.last_sequence[self._service.contact_index[name]] = -1
-            self._set_terms(name, limits, frame, device)
-        self._service.leases.holders |= dict.fromkeys(contacts, client)
+        if not self._loading.acquire(blocking=False):  # whoever comes now would feel the change
+            raise Refused("busy", "another model is being loaded")
+        try:
+            self._silence(contacts)
+            for name in contacts:
+                self._set_terms(name, limits, frame, device)
+            self._service.leases.holders |= dict.fromkeys(contacts, client)
+        finally:
+            self._loading.release()
         return {
             "contacts": contacts,
             "limits": limits._asdict(),
@@ -152,10 +157,14 @@ class Control:
     def _set_terms(self, name: str, limits: Limits, frame: Frame, device: Device | None) -> None:
         contact = self._service.contact_index[name]
         rotation, origin = np.array(frame.rotation), np.array(frame.origin_m)
+        terms = (
+            self._service.leases.terms
+        )  # tell what the loop goes by also when only half of it could be changed
         held_since = self._service.between_ticks(loop.set_frame, contact, rotation, frame.scale, origin)
+        terms[name] = Terms(terms[name].limits, frame, device, held_since, held_since)
         # The tip is at rest now, where it does not matter that the limits come a tick later.
         since = self._service.between_ticks(loop.set_limits, contact, np.array(limits))
-        self._service.leases.terms[name] = Terms(limits, frame, device, since, held_since)
+        terms[name] = replace(terms[name], limits=limits, since_tick=since)
 
     def _warnings(self, contacts: Iterable[str]) -> list[str]:
         """What whoever renders these contacts with the device it named should know of the model that runs."""
@@ -204,6 +213,9 @@ class Control:
             most = getattr(ceiling, field)
             if field == "max_damping_n_s_per_m":
                 allowed, expected = 0 <= value <= most, f"0 to {most:g}"
+            elif field == "max_speed_m_per_s":
+                allowed = min(LEAST_SPEED_M_PER_S, most) <= value <= most
+                expected = f"{LEAST_SPEED_M_PER_S:g} to {most:g}, so that a tip can be withdrawn"
             elif field == "max_force_rate_n_per_s":
                 allowed = least_rate <= value <= most
                 expected = f"{least_rate:g} to {most:g}, so that a force can fade in time"
@@ -226,10 +238,10 @@ class Control:
 
     def _load(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
         """Check another model file, build it beside the running one, fade over to it, and let the old one go."""
-        self._check_alone(client)
         if not self._loading.acquire(blocking=False):
-            raise Refused("busy", "another model is being loaded")
+            raise Refused("busy", "another model is being loaded, or a contact acquired")
         try:
+            self._check_alone(client)
             service = self._service
             model = self._read_model(_needed(request, "model"))
             following = layout.make_model(model.discrete, service.memory.displacement.ravel().copy())
@@ -241,20 +253,29 @@ class Control:
                 snapshot_tick=np.full(1, -1),
                 snapshot_state=np.zeros(model.order),
             )
-            self._handed_over += (service.memory, fading, memory)
+            self._handed_over = (fading, memory)
             service.undisturbed_since_tick = service.between_ticks(loop.exchange, make_image(fading))
             while fading.fade[0] < 1.0:
                 if service.stopping.wait(model.period_s):
                     raise Refused("stopping", "the server is stopping")
             with service.model_in_use:
-                service.between_ticks(loop.exchange, make_image(memory))
+                self._end_exchange(memory)
                 service.memory, service.model = memory, model
-            self._handed_over.clear()
             log.info("now serving %s (order %d)", model.name, model.order)
             warnings = self._warnings(self._service.leases.held_by(client))
             return {"model": model.name, "order": model.order, "warnings": warnings}
         finally:
             self._loading.release()
+
+    def _end_exchange(self, memory: layout.Memory) -> None:
+        """What has been begun is ended, however long ticks are in coming: or until the server stops."""
+        while True:
+            try:
+                self._service.between_ticks(loop.exchange, make_image(memory))
+                return
+            except Refused as error:
+                if error.reason != "busy":
+                    raise
 
     def _read_model(self, name: object) -> ReducedModel:
         if not isinstance(name, str) or Path(name).name != name or name in ("", ".", ".."):

@@ -39,9 +39,10 @@ LOCK, DEADLINE_NS, STOP, HEAD, CHANGE = range(5)
 COMMANDED_TICKS, FRESH_TICKS = range(2)
 # Kinds of Changes, and the columns of its integers.
 NO_CHANGE, LIMITS, FRAME, RESET, EXCHANGE = range(5)
+TAKEN = -1  # by the tick that carries it out
 CHANGED_CONTACT, CHANGED_AT_TICK = range(2)
 # Columns of Commands.integers; Memory.record_inputs has the age and the flags behind the first two.
-SEQUENCE, CLIENT_TIME_NS, ARRIVAL_NS, RENDERED_TICK = range(4)
+SEQUENCE, CLIENT_TIME_NS, ARRIVAL_NS, RENDERED_TICK, LEASE = range(5)
 AGE_NS, CONTACT_FLAGS = 2, 3
 # Columns of Memory.record_times.
 START_NS, TICK_DEADLINE_NS, COMPUTE_NS, TICK_FLAGS = range(4)
@@ -56,11 +57,14 @@ TIMER_LATENESS, TICK_LATENESS, COMPUTE_TIME, INPUT_AGE = range(4)
 class Commands(NamedTuple):
     """The newest command of each contact, handed over under sequence locks. n = n_contacts.
 
-    versions (n,); integers (n, 4): SEQUENCE (-1: none yet), CLIENT_TIME_NS, ARRIVAL_NS, RENDERED_TICK (the tick whose
-    force the device was rendering until then, -1: not told); target (n, 3), m; velocity (n, 3), m/s
+    versions (n,); lease (n,): the number of the present hold, which grows when it ends; integers (n, 5): SEQUENCE (-1:
+    none yet), CLIENT_TIME_NS, ARRIVAL_NS, RENDERED_TICK (the tick whose force the device was rendering until then, -1: not
+    told), LEASE (of the hold that the command was checked for: of another one it is not carried out); target (n, 3), m;
+    velocity (n, 3), m/s
     """
 
     versions: Integers
+    lease: Integers
     integers: Integers
     target: Floats
     velocity: Floats
@@ -104,10 +108,11 @@ class Memory(NamedTuple):
     histograms       (4, HISTOGRAM_BINS) counts, and longest_ns (4,)
     limits           (n, 5), the fields of safety.Limits
     rotation (n, 3, 3), frame_scale (n,), origin (n, 3): the holders' frames, as in frames.Frame
-    commands         what clients want; read_integers (4,), read_motion (6,): a read that may be torn; newest_integers, target, velocity: what the tick last read of it
-    position, applied, step, device_force, previous_force, rendered_force  (n, 3), m and N, in the holders' frames:
-                     where the tip is wanted, where it is, how far that is from the tick before, the force, the one
-                     before, and the one that the device was rendering
+    commands         what clients want; read_integers (5,), read_motion (6,): a read that may be torn;
+                     newest_integers, target, velocity: what the tick last read of it
+    position, device, step, applied, device_force, previous_force, rendered_force  (n, 3), m and N, in the holders'
+                     frames: where the tip is wanted, where the device is by that, and how far from the tick before,
+                     where the tip is, the force, the one before, and the one that the device was rendering
     displacement, force  (n, 3), m and N, the model's input and output
     scale, energy    (n,), how much of the force is given out; J that the port took in
     model, next_model  the one that runs, and the one that is faded in; fade (2,): the share of the latter's force, and by
@@ -136,8 +141,9 @@ class Memory(NamedTuple):
     target: Floats
     velocity: Floats
     position: Floats
-    applied: Floats
+    device: Floats
     step: Floats
+    applied: Floats
     device_force: Floats
     previous_force: Floats
     rendered_force: Floats
@@ -189,7 +195,7 @@ def make_memory(
     """A model at rest, with no command yet, whose first deadline is a period from now."""
     n = len(limits)
     period_ns = round(period_s * 1e9)
-    no_command = np.zeros((n, 4), np.int64)
+    no_command = np.zeros((n, 5), np.int64)
     no_command[:, SEQUENCE] = no_command[:, RENDERED_TICK] = -1
     shared = np.zeros(5, np.int64)
     shared[DEADLINE_NS] = time.monotonic_ns() + period_ns
@@ -214,15 +220,18 @@ def make_memory(
         rotation=np.tile(np.eye(3), (n, 1, 1)),
         frame_scale=np.ones(n),
         origin=np.zeros((n, 3)),
-        commands=Commands(np.zeros(n, np.int64), no_command, np.zeros((n, 3)), np.zeros((n, 3))),
-        read_integers=np.zeros(4, np.int64),
+        commands=Commands(
+            np.zeros(n, np.int64), np.zeros(n, np.int64), no_command, np.zeros((n, 3)), np.zeros((n, 3))
+        ),
+        read_integers=np.zeros(5, np.int64),
         read_motion=np.zeros(6),
         newest_integers=no_command.copy(),
         target=np.zeros((n, 3)),
         velocity=np.zeros((n, 3)),
         position=np.zeros((n, 3)),
-        applied=np.zeros((n, 3)),
+        device=np.zeros((n, 3)),
         step=np.zeros((n, 3)),
+        applied=np.zeros((n, 3)),
         device_force=np.zeros((n, 3)),
         previous_force=np.zeros((n, 3)),
         rendered_force=np.zeros((n, 3)),

@@ -41,6 +41,7 @@ from palpate_server.layout import (
     EXCHANGE,
     FRAME,
     HEAD,
+    LEASE,
     LIMITS,
     LOCK,
     NO_CHANGE,
@@ -51,6 +52,7 @@ from palpate_server.layout import (
     SHIFTED_AT,
     SKIPPED_TICKS,
     STOP,
+    TAKEN,
     TICKS,
     TICKS_ON_ARRIVAL,
     TIMER_LATENESS,
@@ -79,15 +81,20 @@ def write_command(
     client_time_ns: int,
     arrival_ns: int,
     rendered_tick: int,
+    lease: int,
     target: tuple[float, float, float],
     velocity: tuple[float, float, float],
 ) -> None:
-    """Hand the newest displacement (m, finite) of a contact to the loop. One thread at a time may call this."""
+    """Hand the newest displacement (m, finite) of a contact to the loop. One thread at a time may call this.
+
+    lease: commands.lease[contact], read before it was checked whether the client holds the contact
+    """
     begin_write(commands.versions, contact)
     commands.integers[contact, SEQUENCE] = sequence
     commands.integers[contact, CLIENT_TIME_NS] = client_time_ns
     commands.integers[contact, ARRIVAL_NS] = arrival_ns
     commands.integers[contact, RENDERED_TICK] = rendered_tick
+    commands.integers[contact, LEASE] = lease
     for i in range(3):
         commands.target[contact, i] = target[i]
         commands.velocity[contact, i] = velocity[i]
@@ -96,8 +103,12 @@ def write_command(
 
 @compiled
 def forget_command(commands: Commands, contact: int) -> None:
-    """The contact's client is gone: its force fades from the next tick on, without being held first."""
+    """The contact's client is gone: its force fades from the next tick on, without being held first.
+
+    Nor is what the client may still have sent, and nobody has looked at yet, carried out.
+    """
     begin_write(commands.versions, contact)
+    commands.lease[contact] += 1
     commands.integers[contact, SEQUENCE] = -1
     end_write(commands.versions, contact)
 
@@ -156,7 +167,7 @@ def exchange(image: Image, replacement: Image) -> None:
 
 @compiled
 def changed_at(image: Image) -> int:
-    """The first tick after the change that was asked for, or -1 while no tick has taken it up."""
+    """The first tick after the change that was asked for, or -1 while none has carried it out."""
     m = view(image)
     if load_acquire(m.shared, CHANGE) != NO_CHANGE:
         return -1
@@ -164,11 +175,19 @@ def changed_at(image: Image) -> int:
 
 
 @compiled
+def withdraw_change(image: Image) -> bool:
+    """Take the change out of the slot again; False when a tick has taken it up already."""
+    m = view(image)
+    kind = load_acquire(m.shared, CHANGE)
+    return kind > NO_CHANGE and compare_and_swap(m.shared, CHANGE, kind, NO_CHANGE)
+
+
+@compiled
 def take_up_change(image: Image) -> None:
     """Carry out what is in the slot. Called with the tick lock held, or in a replay; afterwards the image may be another."""
     m = view(image)
     kind = load_acquire(m.shared, CHANGE)
-    if kind == NO_CHANGE:
+    if kind == NO_CHANGE or not compare_and_swap(m.shared, CHANGE, kind, TAKEN):
         return
     changes = m.changes
     contact = changes.integers[CHANGED_CONTACT]

@@ -274,6 +274,7 @@ def _hand_over(
         client_time_ns,
         message["server_time_ns"] - message["input_age_ns"][contact],
         command.rendered_tick,
+        int(memory.commands.lease[contact]),
         command.displacement_m[name],
         command.velocity_m_per_s[name],
     )

@@ -131,16 +131,16 @@ class Server:
         service.forget_commands(service.names)
         time.sleep((safety.DECAY_NS * 1e-9) + 10 * service.model.period_s)
         self.publish_status()
-        loop.stop(service.memory.shared)
         service.stopping.set()
-        self._queue(_END, lambda: None)
+        loop.stop(service.memory.shared)
+        for declared in reversed(self._declared):
+            declared.undeclare()
+        self._queue(_END, lambda: None)  # nothing comes behind it any more, and what is before it is refused
         self._threads[0].join()
         self.control.end_recording()
         os.eventfd_write(self._wake, 1)
         for thread in self._threads[1:]:
             thread.join()
-        for declared in reversed(self._declared):
-            declared.undeclare()
         os.close(self._wake)
 
     # Commands in, forces out
@@ -164,13 +164,15 @@ class Server:
         except wire.MalformedMessage as error:
             messages.malformed[error.reason] += 1
             return
-        if reason := self._why_refused(command, wire.last_chunk(key)):
+        # Read before it is known who holds the contacts: should one change hands meanwhile, the number tells.
+        lease = service.memory.commands.lease.tolist()
+        if reason := self._why_refused(command, wire.last_chunk(key), lease):
             messages.refused[reason] += 1
             return
         messages.accepted += 1
         for name, displacement in command.displacement_m.items():
             contact = service.contact_index[name]
-            service.last_sequence[contact] = command.sequence
+            service.last_sequence[contact] = (lease[contact], command.sequence)
             messages.accepted_of[contact] += 1
             loop.write_command(
                 service.memory.commands,
@@ -179,13 +181,14 @@ class Server:
                 command.client_time_ns,
                 arrival_ns,
                 command.rendered_tick,
+                lease[contact],
                 displacement,
                 command.velocity_m_per_s[name],
             )
         if loop.tick_on_arrival(service.image, arrival_ns):
             self._send_forces()
 
-    def _why_refused(self, command: wire.Command, client: str) -> str | None:
+    def _why_refused(self, command: wire.Command, client: str, lease: list[int]) -> str | None:
         """One of wire.REFUSED, or None when the command is to be carried out. Refused as a whole or not at all."""
         if self.service.state != "running":
             return "stopping"
@@ -195,7 +198,8 @@ class Server:
                 return "unknown_contact"
             if self.service.leases.holders[name] != client:
                 return "not_holder"
-            if command.sequence <= self.service.last_sequence[contact]:
+            last_lease, last_sequence = self.service.last_sequence[contact]
+            if last_lease == lease[contact] and command.sequence <= last_sequence:
                 return "old_sequence"
         if not wire.is_finite(command):
             return "not_finite"
@@ -238,20 +242,19 @@ class Server:
         return [notice for notice in (realtime.raise_priority(priority), pinned) if notice]
 
     def _send_at_deadlines(self) -> None:
+        self._prepare_thread(realtime.COMMAND_PRIORITY)  # that a force fades is told by this thread alone
         while not self.service.stopping.is_set():
             os.eventfd_read(self._wake)
             self._sending.acquire()
-            self._send_forces_alone()
+            with _logged("forces could not be sent"):
+                self._send_forces_alone()
 
     # Status and surface
 
     def publish_status(self) -> None:
         """Send the status, and see whether the black box has cause to write. No mistake in it ends the service."""
-        try:
-            with self._publishing:
-                self._publish_status()
-        except Exception:
-            log.exception("the status could not be sent")
+        with _logged("the status could not be sent"), self._publishing:
+            self._publish_status()
 
     def _publish_status(self) -> None:
         recorder = self.service.recorder
@@ -271,16 +274,17 @@ class Server:
             due_s = max(due_s + service.surface_period_s, time.monotonic())
             if not self._surface.matching_status:
                 continue
-            with service.model_in_use:
-                surface = service.model.surface
-                state = np.zeros(service.model.order)
-                tick = loop.read_snapshot(service.image, state, tips)
-            if tick <= last_tick:
-                continue
-            last_tick = tick
-            displacement = surface.output @ state.astype(np.float32)
-            displacement += surface.feedthrough @ tips.ravel().astype(np.float32)
-            self._surface.put(wire.encode_surface(tick, time.monotonic_ns(), displacement))
+            with _logged("the surface could not be sent"):
+                with service.model_in_use:
+                    surface = service.model.surface
+                    state = np.zeros(service.model.order)
+                    tick = loop.read_snapshot(service.image, state, tips)
+                if tick <= last_tick:
+                    continue
+                last_tick = tick
+                displacement = surface.output @ state.astype(np.float32)
+                displacement += surface.feedthrough @ tips.ravel().astype(np.float32)
+                self._surface.put(wire.encode_surface(tick, time.monotonic_ns(), displacement))
 
     # Queries and leases, one after another on a thread of their own
 
@@ -302,10 +306,8 @@ class Server:
         urgency = _QUERIES
         while urgency != _END:
             urgency, _, event = self._events.get()
-            try:
+            with _logged("a query could not be answered"):
                 event()
-            except Exception:  # one client's query must not end the service of the others
-                log.exception("a query could not be answered")
 
     def _answer_describe(self, query: zenoh.Query) -> None:
         with query:
@@ -350,6 +352,15 @@ class Server:
 
 
 @contextmanager
+def _logged(text: str) -> Iterator[None]:
+    """A mistake in one message must not end the thread that serves all of them: log it and go on."""
+    try:
+        yield
+    except Exception:
+        log.exception(text)
+
+
+@contextmanager
 def _notice_after(seconds: float, text: str) -> Iterator[None]:
     """Say what is going on when it takes longer than this."""
     timer = threading.Timer(seconds, log.info, [text])
@@ -373,7 +384,7 @@ def warm_up(period_s: float, n_contacts: int) -> None:
     )
     limits = [Limits(1.0, 1.0, 1.0, 1.0, 1.0)] * n_contacts
     memory = layout.make_memory(system, period_s, limits, 1 / USUAL_SURFACE_HZ)
-    loop.write_command(memory.commands, 0, 1, 1, 1, -1, wire.STILL, wire.STILL)
+    loop.write_command(memory.commands, 0, 1, 1, 1, -1, 0, wire.STILL, wire.STILL)
     loop.forget_command(memory.commands, 0)
     image = make_image(memory)
     loop.tick_on_arrival(image, time.monotonic_ns())
@@ -385,6 +396,7 @@ def warm_up(period_s: float, n_contacts: int) -> None:
     loop.reset(image)
     loop.exchange(image, make_image(memory))
     loop.changed_at(image)
+    loop.withdraw_change(image)
     loop.read_snapshot(image, np.zeros(2), np.zeros((n_contacts, 3)))
     loop.stop(memory.shared)
     wake = os.eventfd(0)

@@ -24,7 +24,7 @@ class Service:
     """One model in one session. `limits` are what no client can exceed.
 
     state                   "running" or "stopping"; `stopping` is set when all threads are to end
-    last_sequence           of the newest command of each contact
+    last_sequence           of each contact, the number of the lease that its newest command came under, and its sequence
     undisturbed_since_tick  the last reset or change of model: until then a recording can be repeated
     lost_clients            clients whose token went while they held a contact
     model_in_use            held while the surface is computed from the model, and while it is exchanged
@@ -39,7 +39,7 @@ class Service:
         self.contact_index = {name: i for i, name in enumerate(self.names)}
         self.leases = Leases(self.names, limits)
         self.messages = telemetry.MessageCounters(len(self.names))
-        self.last_sequence = [-1] * len(self.names)
+        self.last_sequence = [(0, -1)] * len(self.names)
         self.memory = layout.make_memory(
             model.discrete, model.period_s, [limits] * len(self.names), surface_period_s
         )
@@ -58,21 +58,17 @@ class Service:
             loop.forget_command(self.memory.commands, self.contact_index[name])
 
     def between_ticks(self, ask: Callable[..., None], *what: Any) -> int:
-        """Have the loop change something; the first tick after it. Raises Refused when no tick comes."""
+        """Have the loop change something; the first tick after it. Raises Refused when no tick comes: nothing is changed."""
         with self._changing:
-            self._wait_for_change()
+            if self.stopping.is_set():
+                raise Refused("stopping", "the server is stopping")
+            give_up = time.monotonic() + _CHANGE_TIMEOUT_S
             ask(self.image, *what)
-            return self._wait_for_change()
-
-    def _wait_for_change(self) -> int:
-        give_up = time.monotonic() + _CHANGE_TIMEOUT_S
-        while (tick := loop.changed_at(self.image)) < 0:
-            if time.monotonic() > give_up:
-                raise Refused(
-                    "busy", "no tick came that could have made the change: the server is overloaded"
-                )
-            time.sleep(self.model.period_s / 4)
-        return tick
+            while (tick := loop.changed_at(self.image)) < 0:
+                if time.monotonic() > give_up and loop.withdraw_change(self.image):
+                    raise Refused("busy", "no tick came that could have made the change")
+                time.sleep(self.model.period_s / 4)
+            return tick
 
     def status(self) -> dict[str, Any]:
         return telemetry.status(

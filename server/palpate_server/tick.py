@@ -27,6 +27,7 @@ from palpate_server.layout import (
     HISTOGRAM_BINS,
     INPUT_AGE,
     LATE_TICKS,
+    LEASE,
     MAX_DAMPING,
     MAX_FORCE,
     MAX_FORCE_RATE,
@@ -49,8 +50,8 @@ from palpate_server.safety import Flags
 _BIN_NS = 1_000  # of a histogram
 _RETRIES = 100  # of a read that a writer disturbs; afterwards the value before is used again
 
-# The tissue counts as at rest when no tip touches it and no contact's force is above this for so many ticks; its state
-# is then put to zero exactly, which also keeps it from decaying into slow denormal numbers.
+# The tissue counts as at rest when every tip is at the undeformed surface and the model's force is not above this for so
+# many ticks; its state is then put to zero exactly, which also keeps it from decaying into slow denormal numbers.
 _REST_FORCE_N = 1e-9
 _REST_TICKS = 500
 
@@ -103,10 +104,14 @@ def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
             safety.reconstruct(m.target[i], m.velocity[i], age, m.position[i])
         elif has_faded(m, i):
             # Nobody feels it any more: withdraw the tip, so that the tissue comes to rest.
-            m.position[i] = m.origin[i]
+            m.position[i] = m.device[i] = m.origin[i]
             m.energy[i] = 0.0
-        for j in range(3):
-            m.step[i, j] = m.applied[i, j]
+        m.step[i] = 0.0
+        if live and safety.all_finite(m.position[i]):
+            # Energy goes through the port as the device moves, however slowly the tip is let after it.
+            for j in range(3):
+                m.step[i, j] = m.position[i, j] - m.device[i, j]
+                m.device[i, j] = m.position[i, j]
         flags |= safety.follow(
             m.position[i],
             m.applied[i],
@@ -119,8 +124,6 @@ def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
             flags &= ~_JUMPED  # that is our own withdrawal
         elif flags & _SPEED_LIMITED and m.record_inputs[(tick - 1) % RECORDS, i, CONTACT_FLAGS] & _JUMPED:
             flags |= _JUMPED  # still on its way
-        for j in range(3):
-            m.step[i, j] = m.applied[i, j] - m.step[i, j]
         frames.to_model(m.rotation[i], m.frame_scale[i], m.origin[i], m.applied[i], m.displacement[i])
         scale = safety.fade(m.scale[i], live and not flags & _JUMPED, period)
         if live:
@@ -227,25 +230,22 @@ def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
 
 @compiled
 def _settle(m: Memory, tick: int) -> None:
-    """Note whether everything is at rest, and put the model's state to zero when what is left of it is negligible."""
-    moving = m.fade[1] > 0.0
+    """Put the model's state to zero when what is left of it is negligible, and note since when all is at rest."""
+    faded, still = True, m.fade[1] == 0.0
     for i in range(m.applied.shape[0]):
-        moving = moving or not has_faded(m, i)
+        faded = faded and has_faded(m, i)
         for j in range(3):
-            moving = moving or m.displacement[i, j] != 0.0
-    if moving:
+            still = still and m.displacement[i, j] == 0.0
+    if not (faded and still):
         m.counters[AT_REST_SINCE] = -1
-        m.counters[QUIET_TICKS] = 0
-    elif m.counters[AT_REST_SINCE] < 0:
-        for i in range(m.force.shape[0]):
-            for j in range(3):
-                if abs(m.force[i, j]) > _REST_FORCE_N:
-                    m.counters[QUIET_TICKS] = 0
-                    return
-        m.counters[QUIET_TICKS] += 1
-        if m.counters[QUIET_TICKS] >= _REST_TICKS:
-            m.model.state[:] = 0.0
-            m.counters[AT_REST_SINCE] = tick + 1
+    for i in range(m.force.shape[0]):
+        for j in range(3):
+            still = still and abs(m.force[i, j]) <= _REST_FORCE_N
+    m.counters[QUIET_TICKS] = m.counters[QUIET_TICKS] + 1 if still else 0
+    if m.counters[QUIET_TICKS] == _REST_TICKS:
+        m.model.state[:] = 0.0
+    if m.counters[QUIET_TICKS] >= _REST_TICKS and faded and m.counters[AT_REST_SINCE] < 0:
+        m.counters[AT_REST_SINCE] = tick + 1
 
 
 @compiled
@@ -258,8 +258,12 @@ def _read_command(m: Memory, contact: int) -> bool:
     before = m.newest_integers[contact, SEQUENCE]
     for _ in range(_RETRIES):
         version = begin_read(commands.versions, contact)
-        for i in range(4):
+        for i in range(5):
             m.read_integers[i] = commands.integers[contact, i]
+        if m.read_integers[LEASE] != commands.lease[contact]:
+            m.read_integers[
+                SEQUENCE
+            ] = -1  # checked while its client held the contact, written when it no longer did
         for i in range(3):
             m.read_motion[i] = commands.target[contact, i]
             m.read_motion[3 + i] = commands.velocity[contact, i]
@@ -295,7 +299,8 @@ def count(m: Memory, histogram: int, duration_ns: int) -> None:
 def put_to_rest(m: Memory, contact: int) -> None:
     """The tip is where its frame has its rest, on the undeformed surface, and nothing has gone through its port."""
     for i in range(3):
-        m.target[contact, i] = m.position[contact, i] = m.applied[contact, i] = m.origin[contact, i]
+        m.target[contact, i] = m.position[contact, i] = m.device[contact, i] = m.origin[contact, i]
+        m.applied[contact, i] = m.origin[contact, i]
         m.velocity[contact, i] = 0.0
         m.displacement[contact, i] = 0.0
     m.energy[contact] = 0.0

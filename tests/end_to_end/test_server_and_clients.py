@@ -13,6 +13,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Callable
@@ -591,6 +592,34 @@ def test_metrics_of_a_running_server_are_served_to_prometheus(
     finally:
         process.kill()
         process.communicate()
+
+
+def test_a_client_that_never_stops_asking_does_not_keep_the_server_from_stopping(
+    serve: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve()
+    with connect(served.endpoint) as client:
+        assert client.acquire("tip")[0]
+        done = threading.Event()
+
+        def ask() -> None:
+            while not done.is_set():
+                payload = msgpack.packb({"limits": {"max_force_n": 1.0}})
+                for _ in client.session.get(
+                    f"palpate/test/control/{client.name}/limits", payload=payload, timeout=0.5
+                ):
+                    pass
+
+        threads = [threading.Thread(target=ask) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        try:
+            time.sleep(0.3)
+            assert served.stop() == 0  # `stop` gives up after 20 s
+        finally:
+            done.set()
+            for thread in threads:
+                thread.join()
 
 
 def test_a_killed_client_leaves_a_black_box_behind(

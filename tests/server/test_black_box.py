@@ -23,7 +23,17 @@ def run(memory: layout.Memory, ticks: int, depth_m: float, first: int = 0) -> No
     for i in range(first, first + ticks):
         now = time.monotonic_ns()
         memory.shared[layout.DEADLINE_NS] = now + PERIOD_NS // 4
-        loop.write_command(memory.commands, 0, i, 7, now, -1, (0.0, 0.0, depth_m), (0.0, 0.0, 0.0))
+        loop.write_command(
+            memory.commands,
+            0,
+            i,
+            7,
+            now,
+            -1,
+            int(memory.commands.lease[0]),
+            (0.0, 0.0, depth_m),
+            (0.0, 0.0, 0.0),
+        )
         loop.tick_on_arrival(image, now)
 
 

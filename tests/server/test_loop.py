@@ -23,8 +23,9 @@ PERIOD_NS = 1_000_000
 def command(
     memory: layout.Memory, sequence: int, target: tuple[float, float, float], age_ns: int = 0
 ) -> None:
+    lease = int(memory.commands.lease[0])
     loop.write_command(
-        memory.commands, 0, sequence, 7, time.monotonic_ns() - age_ns, -1, target, (0.0, 0.0, 0.0)
+        memory.commands, 0, sequence, 7, time.monotonic_ns() - age_ns, -1, lease, target, (0.0, 0.0, 0.0)
     )
 
 
@@ -344,10 +345,10 @@ def test_extreme_numbers_hold_the_tip_and_leave_another_contact_alone(
         now = time.monotonic_ns()
         good = (0.0, 0.0, 1e-3)
         for m in (memory, undisturbed):
-            loop.write_command(m.commands, 1, i, 7, now, -1, good, (0.0, 0.0, 0.0))
-            loop.write_command(m.commands, 0, i, 7, now, -1, good, (0.0, 0.0, 0.0))
+            loop.write_command(m.commands, 1, i, 7, now, -1, 0, good, (0.0, 0.0, 0.0))
+            loop.write_command(m.commands, 0, i, 7, now, -1, 0, good, (0.0, 0.0, 0.0))
         if i >= 250:
-            loop.write_command(memory.commands, 0, i, 7, now - 5_000_000, -1, huge, huge)
+            loop.write_command(memory.commands, 0, i, 7, now - 5_000_000, -1, 0, huge, huge)
         for m in (memory, undisturbed):
             tick(m)
     row = (loop.records_written(memory.shared) - 1) % layout.RECORDS
@@ -370,7 +371,7 @@ def test_a_target_without_a_finite_length_is_not_followed(memory: layout.Memory,
 
 def test_a_velocity_carries_the_displacement_on_between_commands(memory: layout.Memory) -> None:
     now = time.monotonic_ns()
-    loop.write_command(memory.commands, 0, 1, 7, now - 4_000_000, -1, (1e-3, 0.0, 0.0), (0.1, 0.0, 0.0))
+    loop.write_command(memory.commands, 0, 1, 7, now - 4_000_000, -1, 0, (1e-3, 0.0, 0.0), (0.1, 0.0, 0.0))
     _, applied, *_ = tick(memory)
     assert 1.4e-3 <= applied[0] <= 1.5e-3  # 4 ms at 0.1 m/s, and no more than 5 ms
 
@@ -382,7 +383,7 @@ def test_energy_counts_the_force_that_the_device_was_rendering(memory: layout.Me
         position = (0.0, 0.0, 1e-3 * np.sin(0.2 * i))
         rendered = i - 3 if i >= 3 else -1  # a device that is three ticks behind
         now = time.monotonic_ns()
-        loop.write_command(memory.commands, 0, i, 7, now, rendered, position, (0.0, 0.0, 0.0))
+        loop.write_command(memory.commands, 0, i, 7, now, rendered, 0, position, (0.0, 0.0, 0.0))
         _, applied, force, _ = tick(memory)
         if i:
             step = applied[2] - positions[-1]
@@ -391,6 +392,66 @@ def test_energy_counts_the_force_that_the_device_was_rendering(memory: layout.Me
         positions.append(applied[2])
     row = (loop.records_written(memory.shared) - 1) % layout.RECORDS
     np.testing.assert_allclose(memory.record_motion[row, 0, layout.ENERGY_J], expected, rtol=1e-9)
+
+
+def test_energy_is_that_of_the_device_also_while_the_tip_is_let_after_it_slowly(
+    spring: layout.Memory,
+) -> None:
+    """A limit of the speed makes of a passive spring one that gives out energy: the observer has to see it."""
+    spring.limits[0, layout.MAX_SPEED] = 0.17
+    spring.limits[0, layout.MAX_FORCE] = spring.limits[0, layout.MAX_FORCE_RATE] = 1e6
+    energy, force, before = 0.0, np.zeros(3), 0.0
+    limited = False
+    for i in range(3000):
+        position = 0.008 * np.sin(2 * np.pi * 5 * i * 1e-3)
+        command(spring, i, (0.0, 0.0, position))
+        energy += force[2] * (position - before)
+        before = position
+        flags, _, force, _ = tick(spring)
+        limited = limited or bool(flags & Flags.SPEED_LIMITED)
+    assert limited
+    assert energy < -0.1
+    np.testing.assert_allclose(spring.energy[0], energy, rtol=1e-9)
+
+
+def test_a_command_of_a_hold_that_is_over_is_not_carried_out(memory: layout.Memory) -> None:
+    now = time.monotonic_ns()
+    loop.forget_command(memory.commands, 0)
+    loop.write_command(memory.commands, 0, 5, 7, now, -1, 0, (0.0, 0.0, 1e-3), (0.0, 0.0, 0.0))
+    flags, applied, _, scale = tick(memory)
+    assert flags == Flags.STALE
+    np.testing.assert_array_equal(applied, 0)
+    loop.write_command(memory.commands, 0, 1, 7, now, -1, 1, (0.0, 0.0, 1e-3), (0.0, 0.0, 0.0))
+    flags, applied, _, scale = tick(memory)
+    assert scale > 0
+    np.testing.assert_array_equal(applied, (0.0, 0.0, 1e-3))
+
+
+def test_a_change_that_is_withdrawn_is_not_made(memory: layout.Memory) -> None:
+    image = make_image(memory)
+    loop.set_limits(image, 0, np.full(5, 2.0))
+    assert loop.withdraw_change(image)
+    tick(memory)
+    np.testing.assert_array_equal(memory.limits[0], FREE)
+    loop.set_limits(image, 0, np.full(5, 2.0))
+    tick(memory)
+    assert not loop.withdraw_change(image)
+    np.testing.assert_array_equal(memory.limits[0], 2.0)
+
+
+def test_a_client_that_hovers_at_the_surface_does_not_leave_the_state_to_decay_for_ever(
+    memory: layout.Memory,
+) -> None:
+    for i in range(300):
+        command(memory, i, (0.0, 0.0, 1e-3))
+        tick(memory)
+    for i in range(300, 20_000):
+        command(memory, i, (0.0, 0.0, 0.0))
+        tick(memory)
+        if not np.any(memory.model.state):
+            break
+    assert not np.any(memory.model.state)
+    assert memory.counters[layout.AT_REST_SINCE] == -1  # somebody is there
 
 
 def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(
@@ -570,7 +631,7 @@ def test_the_deadline_loop_goes_on_while_python_is_busy(
 def _write_pairs(commands: layout.Commands, n: int) -> None:
     for i in range(n):
         pair = (float(i), float(i), float(i))
-        loop.write_command(commands, 0, i, i, i, -1, pair, pair)
+        loop.write_command(commands, 0, i, i, i, -1, 0, pair, pair)
 
 
 @njit(nogil=True)

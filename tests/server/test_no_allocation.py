@@ -38,7 +38,7 @@ def commanded_ticks(n: int, commands: layout.Commands, image: Image, start_ns: i
     for k in range(n):
         now = start_ns + k * PERIOD_NS
         depth = 0.03 if k % 40 < 20 else 0.0
-        loop.write_command(commands, 0, k, now, now, -1, (0.0, 0.0, depth), (0.0, 0.0, 0.0))
+        loop.write_command(commands, 0, k, now, now, -1, 0, (0.0, 0.0, depth), (0.0, 0.0, 0.0))
         loop.repeat_tick(image, now)
 
 
@@ -130,8 +130,9 @@ def test_no_tick_allocates_while_one_model_fades_into_another(
     assert ticks.allocations(commanded_ticks, 300) == 0
     following = layout.make_model(make_spring_mass_model(2, 7).discrete)
     fading = ticks.memory._replace(next_model=following, fade=np.array([0.0, 0.01]))
-    ticks.memory, ticks.image = fading, make_image(fading)
+    loop.exchange(ticks.image, make_image(fading))
     assert ticks.allocations(commanded_ticks, 50) == 0
+    assert loop.changed_at(ticks.image) >= 0
     assert fading.fade[0] == pytest.approx(0.5)
     assert np.any(following.state)
 

@@ -46,7 +46,7 @@ def run(recording: Recorder, memory: layout.Memory, ticks: int) -> None:
         tick = int(memory.counters[layout.TICKS])
         recording.command(KEYS.command("c"), command(tick))
         now = time.monotonic_ns()
-        loop.write_command(memory.commands, 0, tick, 7, now, -1, (0.0, 0.0, 1e-4), (0.0, 0.0, 0.0))
+        loop.write_command(memory.commands, 0, tick, 7, now, -1, 0, (0.0, 0.0, 1e-4), (0.0, 0.0, 0.0))
         loop.repeat_tick(image, now)
 
 

@@ -74,6 +74,7 @@ class Recorded:
                     now,
                     now,
                     rendered_tick,
+                    int(self.memory.commands.lease[0]),
                     (x, y, z),
                     (0.01, 0.0, 0.0),
                 )

@@ -7,14 +7,15 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
+from types import SimpleNamespace, TracebackType
 from typing import Any
 
 import msgpack
+import numpy as np
 import pytest
 
 from palpate.model import ReducedModel
-from palpate_server import loop, service, wire
+from palpate_server import layout, loop, service, wire
 from palpate_server import server as server_module
 from palpate_server.leases import Refused
 from palpate_server.safety import Limits
@@ -45,6 +46,13 @@ class Query:
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
         pass
+
+
+class Sized(bytes):
+    """As much of a Zenoh payload as the server looks at."""
+
+    def to_bytes(self) -> bytes:
+        return bytes(self)
 
 
 @pytest.fixture
@@ -92,18 +100,18 @@ def test_while_forces_fade_for_a_new_hold_no_command_is_heard(
 ) -> None:
     server.service.leases.holders |= {"tip": "first", "tip1": "first"}
     command = wire.Command(1, 1, {"tip1": wire.STILL}, {"tip1": wire.STILL})
-    assert server._why_refused(command, "first") is None
+    assert server._why_refused(command, "first", [0, 0]) is None
     heard = []
 
     def listen(image: object, contact: int) -> bool:
-        heard.append(server._why_refused(command, "first"))
+        heard.append(server._why_refused(command, "first", [0, 0]))
         return True
 
     monkeypatch.setattr(loop, "is_silent", listen)
     monkeypatch.setattr(server.control, "_has_token", lambda client: True)
     server.control.carry_out("first", "acquire", {"contacts": ["tip", "tip1"]})
     assert heard == ["not_holder", "not_holder"]
-    assert server._why_refused(command, "first") is None
+    assert server._why_refused(command, "first", [0, 0]) is None
 
 
 def test_too_many_waiting_queries_are_refused_at_once_and_a_lease_that_ends_is_heard_first(
@@ -123,16 +131,90 @@ def test_too_many_waiting_queries_are_refused_at_once_and_a_lease_that_ends_is_h
     assert {query.refusals[0]["reason"] for query in queries[:-1]} == {"unknown_action"}
 
 
-def test_without_a_tick_a_change_is_refused_and_the_next_one_waits_for_it(
+def test_without_a_tick_a_change_is_refused_and_not_made_later_either(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service, "_CHANGE_TIMEOUT_S", 0.05)
     server.service.leases.holders["tip"] = "first"
-    loop.stop(server.service.memory.shared)
+    memory = server.service.memory
+    loop.stop(memory.shared)
     time.sleep(0.05)  # the tick under way is the last one
-    request = {"limits": {"max_force_n": 1.0}}
-    for _ in range(2):
+    for action, request in (("limits", {"limits": {"max_force_n": 1.0}}), ("reset", {})):
         with pytest.raises(Refused, match="no tick") as refusal:
-            server.control.carry_out("first", "limits", request)
+            server.control.carry_out("first", action, request)
         assert refusal.value.reason == "busy"
     assert server.service.leases.terms["tip"].limits.max_force_n == 10.0
+    memory.scale[:] = 0.5
+    loop.repeat_tick(server.service.image, time.monotonic_ns())
+    assert memory.limits[0, layout.MAX_FORCE] == 10.0
+    assert np.all(memory.scale > 0)  # a reset would have made it zero
+
+
+def test_while_the_server_stops_changes_are_refused_at_once(server: Server) -> None:
+    server.service.leases.holders["tip"] = "first"
+    server.service.stopping.set()
+    started = time.monotonic()
+    for _ in range(20):
+        with pytest.raises(Refused) as refusal:
+            server.control.carry_out("first", "limits", {"limits": {"max_force_n": 1.0}})
+        assert refusal.value.reason == "stopping"
+    assert time.monotonic() - started < 1.0
+
+
+def test_a_command_that_was_checked_before_its_contact_changed_hands_is_not_carried_out(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The receiving thread can lose the processor between the check and the writing."""
+    monkeypatch.setattr(server.control, "_has_token", lambda client: True)
+    assert server.control.carry_out("first", "acquire", {"contacts": ["tip"]})
+    check = server._why_refused
+
+    def check_then_lose_the_contact(command: wire.Command, client: str, lease: list[int]) -> str | None:
+        reason = check(command, client, lease)
+        server.control.carry_out("first", "release", {})
+        server.control.carry_out("second", "acquire", {"contacts": ["tip"]})
+        return reason
+
+    def sample(client: str, sequence: int, depth_m: float) -> Any:
+        message = {"sequence": sequence, "client_time_ns": 1, "displacement_m": {"tip": [0.0, 0.0, depth_m]}}
+        return SimpleNamespace(payload=Sized(wire.pack(message)), key_expr=f"palpate/test/command/{client}")
+
+    monkeypatch.setattr(server, "_send_forces", lambda: None)
+    monkeypatch.setattr(server, "_prepare_thread", lambda priority: [])
+    monkeypatch.setattr(server, "_why_refused", check_then_lose_the_contact)
+    server._on_command(sample("first", 1_000_000, 0.02))
+    monkeypatch.setattr(server, "_why_refused", check)
+    time.sleep(0.05)
+    np.testing.assert_array_equal(server.service.memory.applied, 0)
+    assert server.service.messages.accepted == 1
+    server._on_command(sample("second", 1, 1e-3))
+    assert server.service.messages.accepted == 2
+    time.sleep(0.015)
+    np.testing.assert_array_equal(server.service.memory.applied[0], (0.0, 0.0, 1e-3))
+
+
+def test_while_a_model_is_loaded_nobody_acquires_and_the_other_way_round(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server.control, "_has_token", lambda client: True)
+    server.service.leases.holders["tip"] = "first"
+    answers = []
+
+    def read(name: object) -> ReducedModel:
+        with pytest.raises(Refused) as refusal:
+            server.control.carry_out("second", "acquire", {"contacts": ["tip1"]})
+        answers.append(refusal.value.reason)
+        return server.service.model
+
+    monkeypatch.setattr(server.control, "_read_model", read)
+    server.control.carry_out("first", "load", {"model": "same.npz"})
+    assert answers == ["busy"]
+    assert server.control.carry_out("second", "acquire", {"contacts": ["tip1"]})
+    with pytest.raises(Refused) as refusal:
+        server.control.carry_out("first", "load", {"model": "same.npz"})
+    assert refusal.value.reason == "held"
+
+
+def test_naming_a_contact_twice_is_refused(server: Server) -> None:
+    with pytest.raises(wire.MalformedMessage, match="twice"):
+        server.control.carry_out("first", "acquire", {"contacts": ["tip"] * 3000})
