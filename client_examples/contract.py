@@ -5,7 +5,9 @@ import math
 
 SLACK = 1e-9  # of a newton: rounding
 REMEMBERED = 10_000  # commands: an answer to an older one would break the contract anyway
-GRACE_TICKS = 2  # for what may lie between a command's sending and the tick that it comes too late for
+# A busy machine or network may hold commands up until the force has faded, which the flags tell and nobody has promised to
+# prevent. A link on which nothing moves for as long as this is closed, so that then it is not the link.
+UNHEARD_NS = 1_000_000_000
 
 
 class Contract:
@@ -19,10 +21,7 @@ class Contract:
         self.max_force_n = description["limits"]["max_force_n"]
         self.max_step_n = description["limits"]["max_force_rate_n_per_s"] * description["period_s"]
         self.hold_ns = (description["hold_s"] + description["period_s"]) * 1e9
-        # A client that is silent for so long is STALE.
-        self.fade_ns = (
-            description["hold_s"] + description["decay_s"] + GRACE_TICKS * description["period_s"]
-        ) * 1e9
+        self.fade_ns = (description["hold_s"] + description["decay_s"]) * 1e9
         self.holding = False  # the contact, as far as we know
         self.sent = {}  # sequence -> client_time_ns, the newest REMEMBERED ones
         self.commands = 0
@@ -35,7 +34,7 @@ class Contract:
         self.broken = []
         self._last = None
         self._newest_sent_ns = 0
-        self._sending_since_ns = 0  # without a pause that the server would notice
+        self._sending_since_ns = 0  # without a pause in which our force would fade
         self._unheard = False
 
     def agree(self, terms):
@@ -50,7 +49,7 @@ class Contract:
 
     def on_sent(self, command):
         now_ns = command["client_time_ns"]
-        if now_ns - self._newest_sent_ns > self.hold_ns:
+        if now_ns - self._newest_sent_ns > self.fade_ns:
             self._sending_since_ns = now_ns
         self._newest_sent_ns = now_ns
         self.sent[command["sequence"]] = now_ns
@@ -112,7 +111,7 @@ class Contract:
             self._break(tick, f"it answers command {sequence}, which was not sent (or not at that time)")
 
     def _check_heard(self, tick, sequence, age_ns, stale):
-        """A force that has faded is our own doing when we were silent, but not while we went on sending.
+        """That the force has faded is our own doing when we were silent, but not while we went on sending.
 
         All times are on our clock: the tick began `age_ns` or more after its command was sent. When the message comes
         says nothing: it may have waited while we were paused.
@@ -120,12 +119,12 @@ class Contract:
         sent_ns = self.sent[sequence]
         end_ns = min(sent_ns + age_ns, self._newest_sent_ns)
         unheard_ns = end_ns - max(sent_ns, self._sending_since_ns)
-        unheard = bool(stale) and unheard_ns > self.fade_ns
+        unheard = bool(stale) and unheard_ns > UNHEARD_NS
         if unheard and not self._unheard:
             self._break(
                 tick,
-                f"the force has faded although we went on sending: for {unheard_ns / 1e6:.0f} ms no command of "
-                "ours has arrived, or they are refused",
+                f"the force has faded although we went on sending: for {unheard_ns / 1e9:.3g} s no command of ours "
+                "has arrived, or they are refused",
             )
         self._unheard = unheard
 

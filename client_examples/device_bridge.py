@@ -102,7 +102,7 @@ def run(connection, options):
             # Never keep rendering what the server said long ago.
             silence_s = time.monotonic() - newest["heard"]
             if connection.gone.is_set():
-                trouble = "the server is gone: its liveliness token was taken back"
+                trouble = "the server is gone, or the link to it: its liveliness token was taken back"
             elif not contract.holding:
                 trouble = "the contact is no longer ours"
             elif silence_s > options.silence_s:

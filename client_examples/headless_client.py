@@ -161,7 +161,7 @@ def drive(connection, contract, contact, depth, options, last_force):
         contract.on_sent(command)  # before it is sent: the answer may come before `send` returns
         connection.send(command)
         if connection.gone.is_set():
-            return "the server is gone: its liveliness token was taken back"
+            return "the server is gone, or the link to it: its liveliness token was taken back"
         if not contract.holding:
             return None  # nobody would hear us; the contract says why
         if last_force.is_set():

@@ -125,35 +125,47 @@ def test_before_the_first_answer_and_after_a_release_no_command_of_ours_is_known
     assert not said.contract.broken
 
 
-def test_a_client_that_goes_on_sending_while_its_force_fades_is_not_heard() -> None:
+def test_a_client_that_goes_on_sending_for_a_second_while_its_force_has_faded_is_not_heard() -> None:
     said = Conversation()
     newest = said.go_well(100, 200)
-    for now in range(200, 300):
-        said.send(now)
+    for now in range(200, 1300):
+        if now % 60 > 40:  # with pauses that let no force fade
+            said.send(now)
         said.tick(now, newest)
     assert said.contract.holding  # perhaps: nobody has said otherwise
     (broken,) = said.contract.broken
     assert "went on sending" in broken
 
 
-def test_a_client_that_was_silent_itself_finds_nothing_wrong_with_a_faded_force() -> None:
+def test_commands_that_are_held_up_for_longer_than_a_force_takes_to_fade_break_no_promise() -> None:
     said = Conversation()
     newest = said.go_well(100, 200)
-    for now in range(200, 700):  # it sends nothing, but hears
+    for now in range(200, 400):
+        said.send(now)
         said.tick(now, newest)
-    said.go_well(700, 800)
+    said.go_well(400, 500)
+    assert Flags.STALE.name in said.contract.summary()["flags"]
     assert not said.contract.broken
 
 
-@pytest.mark.parametrize("sent_first", [1, 500])
+def test_a_client_that_was_silent_itself_finds_nothing_wrong_with_a_faded_force() -> None:
+    said = Conversation()
+    newest = said.go_well(100, 200)
+    for now in range(200, 2000):  # it sends nothing, but hears
+        said.tick(now, newest)
+    said.go_well(2000, 2100)
+    assert not said.contract.broken
+
+
+@pytest.mark.parametrize("sent_first", [1, 2000])
 def test_a_client_that_was_paused_finds_nothing_wrong_with_what_it_missed(sent_first: int) -> None:
     """What came while it could not listen it hears afterwards, when it has sent commands again."""
     said = Conversation()
     newest = said.go_well(100, 200)
-    for now in range(700, 700 + sent_first):
+    for now in range(2000, 2000 + sent_first):
         said.send(now)
-    for now in range(200, 701):
-        said.tick(now, newest, heard_ms=700 + sent_first)
+    for now in range(200, 2001):
+        said.tick(now, newest, heard_ms=2000 + sent_first)
     assert not said.contract.broken
 
 
