@@ -35,6 +35,12 @@ SECONDS, SUBSTEPS = 2.0, 10
 REST_M = 5e-4  # a handle that moves less, and less and less, is coming to rest
 
 
+def safe_up_to(stable: np.ndarray) -> float:
+    """The stiffness, N/m, below which all is stable; (masses, stiffnesses)."""
+    safe = np.cumprod(stable.all(axis=0)).astype(bool)
+    return float(STIFFNESSES_N_PER_M[safe][-1]) if safe.any() else 0.0
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", nargs="?", type=Path, help="(default: a sample of some 500 N/m)")
@@ -55,6 +61,11 @@ def main() -> None:
             f"{np.mean(part):.0%} at {d} ms" for part, d in zip(stable[controller], DELAYS, strict=True)
         )
         print(f"{'on ' if controller else 'off'}: stable {np.mean(stable[controller]):.0%} ({shares})")
+        for part, delay in zip(stable[controller], DELAYS, strict=True):
+            for b, damping_name in enumerate(DAMPINGS_N_S_PER_M):
+                print(
+                    f"     {delay} ms, {damping_name:g} N s/m: any of the masses up to {safe_up_to(part[:, :, b]):.0f} N/m"
+                )
     lost = np.sum(stable[0.0] & ~stable[damping])
     print(f"stable without control and not with it: {lost} of {stable[0.0].size}")
     if options.out:
