@@ -2,10 +2,11 @@
 
     palpate replay RECORDING.mcap MODEL.npz
 
-What is repeated begins where everything is known to be at rest, and breaks off where a message was lost, the model was
-reset or another one loaded; from the next rest on it is repeated again.
+What is repeated begins where everything is known to be at rest, and breaks off where a message was lost that can't be
+done without, the model was reset or another one loaded; from the next rest on it is repeated again.
 
-Exit code 0: every tick gave the recorded displacement and force exactly. 1: one did not. 2: it can't be replayed.
+Exit code 0: every tick that a status tells of was repeated and gave the recorded displacement and force exactly. 3: all
+that could be repeated did, but not all could be. 1: a tick gave another displacement or force. 2: nothing can be replayed.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ import argparse
 import json
 import struct
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,8 @@ _MAGIC = b"\x89MCAP0\r\n"  # an MCAP file begins with it
 _OF_THE_TICK = int(Flags.LATE | Flags.CAUGHT_UP)  # depend on the machine, not on the model
 _NEEDED = {"ticks", "at_rest_since_tick", "undisturbed_since_tick", "model", "contacts"}  # of a status
 _LIMITED = int(Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED)
+# So far from their place in time commands and forces may stand in a recording: twice what the server sends late.
+_OUT_OF_ORDER_TICKS = 200
 Agreed = TypeVar("Agreed", Limits, Frame)
 
 
@@ -48,26 +51,39 @@ class ReplayError(ValueError):
     """The recording can't be replayed; the message says why."""
 
 
+class Heard(NamedTuple):
+    """A command in a recording, behind the force of a tick, or -1; it may have been refused."""
+
+    command: wire.Command
+    after_tick: int
+
+
 @dataclass
 class Session:
-    """What is in a recording. commands: by contact name's client sequence and time; forces: in order of ticks."""
+    """What is in a recording. commands: by client, sequence and client time, which a client may use more than once, in
+    the order in which they were heard; forces: in order of ticks.
+    """
 
     description: dict[str, Any]
-    commands: dict[tuple[int, int], wire.Command] = field(default_factory=dict)
+    commands: dict[tuple[str, int, int], list[Heard]] = field(default_factory=dict)
     forces: list[dict[str, Any]] = field(default_factory=list)
     statuses: list[dict[str, Any]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """ticks compared, in so many stretches; the first that differed with what was recorded and what came out, or None;
-    and lost_commands, how many ticks used one that is not in the recording.
+    """ticks compared, of so many that a status tells of, from the first recorded one on; with_force: of those compared, how
+    many had a force that is not zero; in so many stretches; the first that differed with what was recorded and what came
+    out, or None; and lost_commands, how many ticks used one that is not in the recording.
 
-    Commands are best effort: instead of one that the recorder missed, the displacement that was really applied is used,
-    which is the same when no limit was met.
+    Commands are best effort: instead of one that the recorder missed, or that can't be told from another, the displacement
+    that was really applied is used. It is the same when no limit was met; and which force the device was rendering, which
+    only the command tells, is of no account without passivity control. Otherwise the stretch ends there.
     """
 
     ticks: int
+    of: int
+    with_force: int
     stretches: int
     difference: str | None
     lost_commands: int
@@ -81,7 +97,7 @@ def read_session(path: Path) -> Session:
             if stream.read(len(_MAGIC)) != _MAGIC:
                 raise ReplayError(f"{path}: not an MCAP file")
             stream.seek(0)
-            for kind, message in _messages(NonSeekingReader(stream)):
+            for kind, key, message in _messages(NonSeekingReader(stream)):
                 if kind == "describe":
                     session = session or Session(message)
                 elif session is None:
@@ -95,7 +111,7 @@ def read_session(path: Path) -> Session:
                         )
                     session.statuses.append(message)
                 elif kind == "command":
-                    _add_command(session, message)
+                    _add_command(session, wire.last_chunk(key), message)
     except (McapError, OSError) as error:
         raise ReplayError(f"{path}: not an MCAP file that can be read ({error})") from error
     except (KeyError, TypeError, json.JSONDecodeError) as error:
@@ -107,26 +123,30 @@ def read_session(path: Path) -> Session:
     return session
 
 
-def _messages(reader: NonSeekingReader) -> Iterator[tuple[str, dict[str, Any]]]:
+def _messages(reader: NonSeekingReader) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """The kind, the key and the content of each."""
     messages = reader.iter_messages(log_time_order=False)
     while True:
         try:
-            schema, _, message = next(messages)
+            schema, channel, message = next(messages)
         except StopIteration:
             return
         except (McapError, struct.error):  # the reader's own, when even a length is cut in two
             return  # it breaks off here: a full disk, a crash
         if schema is not None:
             kind = schema.name.removeprefix("palpate.")
-            yield kind, from_json(kind, message.data)
+            yield kind, channel.topic, from_json(kind, message.data)
 
 
-def _add_command(session: Session, message: dict[str, Any]) -> None:
+def _add_command(session: Session, client: str, message: dict[str, Any]) -> None:
     try:
         command = wire.read_command(message)
     except wire.MalformedMessage:
         return  # the server refused it too
-    session.commands[command.sequence, command.client_time_ns] = command
+    if wire.is_in_range(command):
+        key = client, command.sequence, command.client_time_ns
+        after_tick = session.forces[-1]["tick"] if session.forces else -1
+        session.commands.setdefault(key, []).append(Heard(command, after_tick))
 
 
 def compare(session: Session, model: ReducedModel) -> Comparison:
@@ -144,39 +164,54 @@ def compare(session: Session, model: ReducedModel) -> Comparison:
             "the tissue was never at rest in this recording: start it before the first command, or reset the model first"
         )
     disturbed = {status["undisturbed_since_tick"] for status in session.statuses}
-    told_until = max(
-        status["ticks"] for status in session.statuses
-    )  # afterwards there may have been a change
+    told_until = max(status["ticks"] for status in session.statuses)  # a change after it would be unheard of
+    forces = [message for message in session.forces if message["tick"] < told_until]
+    of = forces[-1]["tick"] + 1 - forces[0]["tick"]
     terms = _Terms(session, names)
+    used = _UsedCommands(session, names)
+    recorded = {message["tick"] for message in forces}
     memory: layout.Memory | None = None
-    compared = stretches = lost = 0
-    for k, message in enumerate(session.forces):
+    compared = with_force = stretches = lost = 0
+    difference = None
+    for k, message in enumerate(forces):
         tick = message["tick"]
-        if tick >= told_until:
-            break
-        if tick in disturbed or (k > 0 and tick != session.forces[k - 1]["tick"] + 1):
+        if tick in disturbed or (k > 0 and tick != forces[k - 1]["tick"] + 1):
             memory = None
-        missing = [_is_missing(session, i, name, message) for i, name in enumerate(names)]
+        commands = used.by(k)
+        missing = [command is None and _is_live(i, message) for i, command in enumerate(commands)]
         if any(m and flags & _LIMITED for m, flags in zip(missing, message["flags"], strict=True)):
             memory = None  # where it wanted the tip to be is not known
             continue
+        begins = memory is None
         if memory is None:
             if not at_rest[k]:
                 continue
             memory = _memory_at_rest(session, model, k)
             image = make_image(memory)
             terms.agree_on_latest(image, tick)
-            stretches += 1
         else:
             terms.agree(image, tick)
-        for i, name in enumerate(names):
-            _hand_over(session, memory, i, name, message)
+        for i, (name, command) in enumerate(zip(names, commands, strict=True)):
+            _hand_over(memory, i, name, message, command)
+        energy_unknown = [
+            i
+            for i, command in enumerate(commands)
+            if _is_live(i, message) and not _tells_rendered_force(command, tick, recorded)
+        ]
+        if np.any(memory.limits[energy_unknown, layout.MAX_DAMPING] > 0.0):
+            memory = None  # its damping goes by the energy
+            continue
         loop.repeat_tick(image, message["server_time_ns"])
         compared += 1
+        stretches += begins
+        with_force += int(np.any(message["force_n"]))
         lost += sum(missing)
         if difference := _difference(message, memory, tick % layout.RECORDS):
-            return Comparison(compared, stretches, f"tick {tick}: {difference}", lost)
-    return Comparison(compared, stretches, None, lost)
+            difference = f"tick {tick}: {difference}"
+            break
+        for i in energy_unknown:
+            memory.energy[i] = message["energy_j"][i]
+    return Comparison(compared, of, with_force, stretches, difference, lost)
 
 
 def _is(told: dict[str, Any], model: ReducedModel) -> bool:
@@ -243,28 +278,85 @@ def _agree(image: Image, contact: int, limits: Limits | None, frame: Frame | Non
         loop.take_up_change(image)
 
 
-def _find(session: Session, contact: int, message: dict[str, Any]) -> wire.Command | None:
-    return session.commands.get((message["sequence"][contact], message["client_time_ns"][contact]))
+class _UsedCommands:
+    """Which recorded commands the ticks used, tick by tick, in order.
+
+    A tick tells a command's sequence and client time. Both may come again, from another client, in another hold, or in a
+    command that was refused; so the statuses tell whose it was, and of those of a hold the server took the first.
+    """
+
+    def __init__(self, session: Session, names: Sequence[str]) -> None:
+        self._session = session
+        self._names = names
+        self._holders: list[dict[int, set[str]]] = [{} for _ in names]  # by the first tick of their hold
+        for status in session.statuses:
+            for holders, state in zip(
+                self._holders, (status["contacts"][name] for name in names), strict=True
+            ):
+                told = holders.setdefault(state["held_since_tick"], set())
+                if state["holder"] is not None:
+                    told.add(state["holder"])
+        self._used: list[wire.Command | None] = [None] * len(names)
+
+    def by(self, k: int) -> list[wire.Command | None]:
+        """For each contact, the command that the k-th recorded tick used, if it did and the recording has it for certain."""
+        message = self._session.forces[k]
+        before = self._session.forces[k - 1]
+        in_a_row = k > 0 and before["tick"] == message["tick"] - 1
+        for i in range(len(self._names)):
+            same = all(message[name][i] == before[name][i] for name in ("sequence", "client_time_ns"))
+            if not (in_a_row and same):
+                self._used[i] = self._find(i, message)
+        return self._used
+
+    def _find(self, contact: int, message: dict[str, Any]) -> wire.Command | None:
+        """The command that a tick was the first to use."""
+        tick, holders = message["tick"], self._holders[contact]
+        held_since = max((first for first in holders if first <= tick), default=-1)
+        if message["sequence"][contact] < 0 or len(holders.get(held_since, ())) != 1:
+            return None
+        (client,) = holders[held_since]
+        key = client, message["sequence"][contact], message["client_time_ns"][contact]
+        begin = self._session.forces[0]["tick"]
+        heard = [
+            (after_tick, command)
+            for command, after_tick in self._session.commands.get(key, ())
+            if self._names[contact] in command.displacement_m
+            and abs(max(after_tick, begin) - tick) <= _OUT_OF_ORDER_TICKS
+        ]
+        if not heard:
+            return None
+        after_tick, first = heard[0]
+        if all(command == first for _, command in heard):
+            return first
+        # Refused, if it was before the hold or for another contact's sake.
+        in_hold = after_tick >= held_since + _OUT_OF_ORDER_TICKS
+        alike = all(command.displacement_m.keys() == first.displacement_m.keys() for _, command in heard)
+        return first if in_hold and alike else None
 
 
-def _is_missing(session: Session, contact: int, name: str, message: dict[str, Any]) -> bool:
-    """Whether the tick used a command for this contact, not an outdated one, that the recording has not."""
-    if message["sequence"][contact] < 0 or message["input_age_ns"][contact] > safety.HOLD_NS:
+def _is_live(contact: int, message: dict[str, Any]) -> bool:
+    """Whether the tick moved the contact to where a command wanted it, one that was not outdated."""
+    return bool(message["sequence"][contact] >= 0 and message["input_age_ns"][contact] <= safety.HOLD_NS)
+
+
+def _tells_rendered_force(command: wire.Command | None, tick: int, recorded: Set[int]) -> bool:
+    """Whether the force is known that the device was rendering: of the recorded tick that it tells, or of the one before."""
+    if command is None:
         return False
-    command = _find(session, contact, message)
-    return command is None or name not in command.displacement_m
+    rendered = command.rendered_tick
+    return not 0 <= rendered < tick or tick - rendered >= layout.RECORDS or rendered in recorded
 
 
 def _hand_over(
-    session: Session, memory: layout.Memory, contact: int, name: str, message: dict[str, Any]
+    memory: layout.Memory, contact: int, name: str, message: dict[str, Any], command: wire.Command | None
 ) -> None:
     """Put the command that the recorded tick used, or one like it, where the repeated tick will find it."""
     sequence, client_time_ns = message["sequence"][contact], message["client_time_ns"][contact]
     if sequence < 0:
         loop.forget_command(memory.commands, contact)
         return
-    command = _find(session, contact, message)
-    if command is None or name not in command.displacement_m:
+    if command is None:
         applied = tuple(message["displacement_m"][contact])
         command = wire.Command(sequence, client_time_ns, {name: applied}, {name: wire.STILL})
     loop.write_command(
@@ -295,7 +387,8 @@ def _difference(message: dict[str, Any], memory: layout.Memory, row: int) -> str
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="palpate replay", description=(__doc__ or "").splitlines()[0])
+    about = (__doc__ or "").strip().split("\n\n")
+    parser = argparse.ArgumentParser(prog="palpate replay", description=about[0], epilog=about[-1])
     parser.add_argument("recording", type=Path, metavar="RECORDING.mcap")
     parser.add_argument("model", type=Path, metavar="MODEL.npz")
     options = parser.parse_args(arguments)
@@ -305,15 +398,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (OSError, ReplayError, ModelFileError) as error:
         print(f"palpate replay: {error}", file=sys.stderr)
         return 2
-    total = len(session.forces)
     if result.lost_commands:
         print(
             f"{result.lost_commands} ticks used a command that the recording has not: their displacement was used"
         )
     where = "" if result.stretches == 1 else f", in {result.stretches} stretches"
-    print(f"{result.ticks} of {total} recorded ticks repeated{where}: ", end="")
-    print("every force is the same, bit for bit" if result.difference is None else result.difference)
-    return 0 if result.difference is None else 1
+    print(f"{result.ticks} of {result.of} ticks repeated{where}, {result.with_force} with a force: ", end="")
+    if result.difference is not None:
+        print(result.difference)
+        return 1
+    if result.ticks < result.of:
+        print("these forces are the same, bit for bit; the others could not be compared")
+        return 3
+    print("every force is the same, bit for bit")
+    return 0
 
 
 if __name__ == "__main__":
