@@ -242,7 +242,7 @@ class Server:
         return [notice for notice in (realtime.raise_priority(priority), pinned) if notice]
 
     def _send_at_deadlines(self) -> None:
-        self._prepare_thread(realtime.COMMAND_PRIORITY)  # that a force fades is told by this thread alone
+        realtime.raise_priority(realtime.COMMAND_PRIORITY)  # that a force fades is told by this thread alone
         while not self.service.stopping.is_set():
             os.eventfd_read(self._wake)
             self._sending.acquire()
