@@ -345,7 +345,9 @@ def test_after_a_missing_command_the_energy_is_known_to_a_passivity_control_that
 ) -> None:
     recorded.agree(OBSERVED)
     give_out_energy(recorded, 200)
-    recorded.agree(CEILING)
+    recorded.agree(
+        CEILING._replace(max_damping_n_s_per_m=1e4)
+    )  # so much that the energy decides how much of it
     give_out_energy(recorded, 200)
     flags = [message["flags"][0] for message in recorded.session.forces[300:]]
     assert np.count_nonzero(np.array(flags) & int(Flags.PASSIVITY_LIMITED)) > 10
@@ -406,6 +408,18 @@ def test_a_command_that_may_have_been_refused_before_the_hold_counts_as_missing(
     assert replay.compare(recorded.session, recorded.model) == expected
 
 
+def test_a_command_that_may_have_been_refused_for_another_contact_counts_as_missing(
+    recorded: Recorded,
+) -> None:
+    recorded.run(400, commanded=True)
+    heard = recorded.session.commands["surgeon", 251, 351_000_000]
+    command, after_tick = heard[0]
+    more = {"tip": (0.0, 0.0, 3e-3), "somebody's": wire.STILL}
+    heard.insert(0, replay.Heard(command._replace(displacement_m=more), after_tick))
+    expected = repeated(recorded.session, range(350), of=500)
+    assert replay.compare(recorded.session, recorded.model) == expected
+
+
 def test_a_client_that_begins_to_count_anew_in_its_next_hold_is_understood(recorded: Recorded) -> None:
     recorded.constant_time = True
     recorded.run(400, commanded=True)
@@ -449,6 +463,18 @@ def test_exit_code_0_is_for_a_recording_of_which_every_tick_was_repeated(
     assert exit_code(recorded, tmp_path) == 0
     said = f"400 of 400 ticks repeated, {with_force} with a force: every force is the same, bit for bit\n"
     assert capsys.readouterr().out == said
+
+
+def test_a_command_that_was_refused_for_its_numbers_is_as_good_as_not_recorded(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    recorded.run(400, commanded=True)
+    heard = recorded.session.commands["surgeon", 251, 351_000_000]
+    command, after_tick = heard[0]
+    for number in (2000.0, float("nan")):
+        refused = command._replace(displacement_m={"tip": (number, 0.0, 0.0)})
+        heard.insert(0, replay.Heard(refused, after_tick))
+    assert exit_code(recorded, tmp_path) == 0
 
 
 def test_exit_code_3_is_for_a_recording_of_which_a_part_could_not_be_compared(
