@@ -197,6 +197,7 @@ def take_up_change(image: Image) -> None:
         m.rotation[contact] = changes.rotation
         m.frame_scale[contact] = changes.scale[0]
         m.origin[contact] = changes.origin
+        m.device[contact] = changes.origin  # after a reset, though, it is where it was
         put_to_rest(m, contact)
     elif kind == RESET:
         m.model.state[:] = 0.0

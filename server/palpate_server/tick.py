@@ -299,8 +299,7 @@ def count(m: Memory, histogram: int, duration_ns: int) -> None:
 def put_to_rest(m: Memory, contact: int) -> None:
     """The tip is where its frame has its rest, on the undeformed surface, and nothing has gone through its port."""
     for i in range(3):
-        m.target[contact, i] = m.position[contact, i] = m.device[contact, i] = m.origin[contact, i]
-        m.applied[contact, i] = m.origin[contact, i]
+        m.target[contact, i] = m.position[contact, i] = m.applied[contact, i] = m.origin[contact, i]
         m.velocity[contact, i] = 0.0
         m.displacement[contact, i] = 0.0
     m.energy[contact] = 0.0

@@ -294,6 +294,9 @@ def test_a_reset_puts_the_tip_to_rest_and_takes_the_force_down_at_the_allowed_ra
         _, _, before, _ = tick(spring)
     assert np.linalg.norm(before) == pytest.approx(USUAL.max_force_n)
     loop.reset(make_image(spring))
+    command(spring, 299, (0.0, 0.0, 0.05))
+    _, _, before, _ = tick(spring)
+    assert spring.energy[0] == 0  # the device has not moved
     for i in range(300, 320):
         command(spring, i, (0.0, 0.0, 0.0))
         flags, applied, force, _ = tick(spring)
