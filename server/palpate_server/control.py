@@ -157,9 +157,7 @@ class Control:
     def _set_terms(self, name: str, limits: Limits, frame: Frame, device: Device | None) -> None:
         contact = self._service.contact_index[name]
         rotation, origin = np.array(frame.rotation), np.array(frame.origin_m)
-        terms = (
-            self._service.leases.terms
-        )  # tell what the loop goes by also when only half of it could be changed
+        terms = self._service.leases.terms  # true at each moment, also if no tick comes for the second half
         held_since = self._service.between_ticks(loop.set_frame, contact, rotation, frame.scale, origin)
         terms[name] = Terms(terms[name].limits, frame, device, held_since, held_since)
         # The tip is at rest now, where it does not matter that the limits come a tick later.
