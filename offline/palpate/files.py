@@ -1,10 +1,24 @@
-"""Files that are there whole or not at all."""
+"""Files that are there whole or not at all, and names that stay in their folder."""
 
 from __future__ import annotations
 
 import os
 import tempfile
 from pathlib import Path
+from typing import TypeGuard
+
+LONGEST_NAME_BYTES = 255  # on the usual file systems
+
+
+def is_plain_name(name: object) -> TypeGuard[str]:
+    """True for what can be a file's name, and leads into no other folder than the one it is looked for in."""
+    return (
+        isinstance(name, str)
+        and name not in ("", ".", "..")
+        and Path(name).name == name
+        and "\0" not in name
+        and len(os.fsencode(name)) <= LONGEST_NAME_BYTES
+    )
 
 
 def write_whole(path: Path, data: bytes) -> None:

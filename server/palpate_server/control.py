@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from palpate.files import LONGEST_NAME_BYTES, is_plain_name
 from palpate.model import ModelFileError, ReducedModel, load_model
 from palpate_server import layout, loop, safety, wire
 from palpate_server.devices import PROFILES, Device, limits_for, warnings_for
@@ -29,7 +29,6 @@ log = logging.getLogger("palpate_server")
 FADE_OVER_S = 0.5  # from one model to another
 LEAST_SPEED_M_PER_S = 0.01
 MOST_DAMPING_N_S_PER_M = 100.0  # that passivity control may do without a device that says what it can
-_LONGEST_FILE_NAME = 255  # bytes, on the usual file systems
 
 
 class Control:
@@ -276,14 +275,11 @@ class Control:
                     raise
 
     def _read_model(self, name: object) -> ReducedModel:
-        if not isinstance(name, str) or Path(name).name != name or name in ("", ".", ".."):
-            raise Refused(
-                "bad_model", f"model is {str(name)[:300]!r}: expected a file's name, without a folder"
-            )
-        if len(os.fsencode(name)) > _LONGEST_FILE_NAME or "\0" in name:
+        if not is_plain_name(name):
             raise Refused(
                 "bad_model",
-                f"model is {name[:40]!r}...: expected a file's name of at most {_LONGEST_FILE_NAME} bytes, none zero",
+                f"model is {str(name)[:300]!r}: expected a file's name, without a folder and of at most "
+                f"{LONGEST_NAME_BYTES} bytes",
             )
         path = self._models / name
         try:

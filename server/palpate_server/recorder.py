@@ -21,6 +21,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
+from palpate.files import LONGEST_NAME_BYTES, is_plain_name
 from palpate_server import layout, loop, wire
 from palpate_server.leases import Refused
 
@@ -31,22 +32,15 @@ _MAX_UNWRITTEN = 16 * 2**20  # bytes: a minute of a contact
 _END_S = 2.0  # to write the rest and end the file
 _PIPE_BYTES = 65536  # that a pipe takes at once
 _TOO_SLOW = "the disk can't keep up"
-_LONGEST_NAME = 255  # bytes, on the usual file systems
 
 
 def file_in(folder: Path, name: object) -> Path:
     """Where a client's recording goes. Raises Refused when that is no plain name of an MCAP file."""
-    if (
-        not isinstance(name, str)
-        or not name.endswith(".mcap")
-        or Path(name).name != name
-        or "\0" in name
-        or len(os.fsencode(name)) > _LONGEST_NAME
-    ):
+    if not is_plain_name(name) or not name.endswith(".mcap"):
         raise Refused(
             "bad_file",
             f"file is {str(name)[:300]!r}: expected the name of a new file, NAME.mcap, without a folder and of at "
-            f"most {_LONGEST_NAME} bytes",
+            f"most {LONGEST_NAME_BYTES} bytes",
         )
     return folder / name
 

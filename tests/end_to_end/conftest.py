@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -22,16 +21,11 @@ import pytest
 import zenoh
 
 from palpate.model import ReducedModel, save_model
+from palpate_server.round_trips import free_endpoint
 
 EXAMPLES = Path(__file__).parents[2] / "client_examples"
 START_S = 60.0  # the first start compiles
 SESSION = "test"
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @dataclass
