@@ -235,6 +235,7 @@ def test_a_change_of_model_ends_what_can_be_repeated_with_either_until_the_next_
         client.command({"tip": [0.0, 0.0, -1e-3]})
         client.next_status()
         assert client.control("load", {"model": "other.npz"})[0]
+        client.next_status()  # one from before the load may still tell of rest
         wait_for(lambda: client.statuses[-1]["at_rest_since_tick"] >= 0, "rest", seconds=60.0)
         rest = client.next_status()["at_rest_since_tick"]
         client.command({"tip": [0.0, 0.0, -1e-3]})
@@ -274,6 +275,7 @@ def test_a_server_that_ends_while_it_records_leaves_a_complete_file(
         assert client.control("record", {"file": "a.mcap"})[0]
         run_example("headless_client.py", served.endpoint, "--duration-s", "60")
         wait_for(lambda: client.forces[-1]["force_scale"][0] == 1.0, "the force")
+        client.next_status()
         wait_for(lambda: client.statuses[-1]["recording"]["messages"] > 2000, "messages")
         code = served.stop(number)
     if number == signal.SIGTERM:
@@ -295,6 +297,7 @@ def test_a_full_disk_ends_a_recording_that_a_client_asked_for_not_the_server(
         resource.prlimit(served.process.pid, resource.RLIMIT_FSIZE, (100_000, before[1]))
         assert client.control("record", {"file": "full.mcap"})[0]
         resource.prlimit(served.process.pid, resource.RLIMIT_FSIZE, before)
+        client.next_status()
         wait_for(lambda: client.statuses[-1]["recording"]["error"], "the end of the recording")
         assert client.statuses[-1]["recording"]["error"] == "File too large"
         assert len(replay.read_session(tmp_path / "full.mcap").forces) > 100
