@@ -69,9 +69,10 @@ def run_reads(n, arrays):
 def run_ticks(n, commands, image, start, period):
     for k in range(n):
         now = start + k * period
-        for contact in range(commands.versions.size):
-            depth = 1e-3 * (k % 64)
-            loop.write_command(commands, contact, k, 1, now, -1, 0, (0.0, 0.0, depth), (0.0, 0.0, 0.0))
+        depth = (0.0, 0.0, 1e-3 * (k % 64))
+        for contact in range(1, commands.lease.size):
+            loop.stage_command(commands, contact, k, 1, now, -1, 0, depth, (0.0, 0.0, 0.0))
+        loop.write_command(commands, 0, k, 1, now, -1, 0, depth, (0.0, 0.0, 0.0))
         loop.repeat_tick(image, now)
 
 

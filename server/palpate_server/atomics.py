@@ -95,7 +95,9 @@ def compare_and_swap(array: Integers, index: int, expected: int, value: int) -> 
 
 
 # A sequence lock: the writer makes the version odd, writes, makes it even; a reader whose version was odd or has
-# changed reads again. One writer at a time; readers never hold it up.
+# changed reads again, up to MAX_READS times. One writer at a time; readers never hold it up, nor it them.
+
+MAX_READS = 100
 
 
 @compiled

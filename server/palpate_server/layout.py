@@ -41,6 +41,8 @@ COMMANDED_TICKS, FRESH_TICKS = range(2)
 NO_CHANGE, LIMITS, FRAME, RESET, EXCHANGE = range(5)
 TAKEN = -1  # by the tick that carries it out
 CHANGED_CONTACT, CHANGED_AT_TICK = range(2)
+# Commands: those that ticks read, and those that wait for the rest of their message.
+NEWEST, STAGED = range(2)
 # Columns of Commands.integers; Memory.record_inputs has the age and the flags behind the first two.
 SEQUENCE, CLIENT_TIME_NS, ARRIVAL_NS, RENDERED_TICK, LEASE = range(5)
 AGE_NS, CONTACT_FLAGS = 2, 3
@@ -55,19 +57,18 @@ TIMER_LATENESS, TICK_LATENESS, COMPUTE_TIME, INPUT_AGE = range(4)
 
 
 class Commands(NamedTuple):
-    """The newest command of each contact, handed over under sequence locks. n = n_contacts.
+    """The newest command of each contact, handed over under a sequence lock. n = n_contacts.
 
-    versions (n,); lease (n,): the number of the present hold, which grows when it ends; integers (n, 5): SEQUENCE (-1:
-    none yet), CLIENT_TIME_NS, ARRIVAL_NS, RENDERED_TICK (the tick whose force the device was rendering until then, -1: not
-    told), LEASE (of the hold that the command was checked for: of another one it is not carried out); target (n, 3), m;
-    velocity (n, 3), m/s
+    versions (1,), of that lock; lease (n,): the number of the present hold, which grows when it ends; integers (2, n, 5),
+    NEWEST and STAGED: SEQUENCE (-1: none yet), CLIENT_TIME_NS, ARRIVAL_NS, RENDERED_TICK (the tick whose force the device
+    was rendering until then, -1: not told), LEASE (of the hold that the command was checked for: of another one it is not
+    carried out); motion (2, n, 6): displacement (m) and velocity (m/s)
     """
 
     versions: Integers
     lease: Integers
     integers: Integers
-    target: Floats
-    velocity: Floats
+    motion: Floats
 
 
 class Changes(NamedTuple):
@@ -108,8 +109,8 @@ class Memory(NamedTuple):
     histograms       (4, HISTOGRAM_BINS) counts, and longest_ns (4,)
     limits           (n, 5), the fields of safety.Limits
     rotation (n, 3, 3), frame_scale (n,), origin (n, 3): the holders' frames, as in frames.Frame
-    commands         what clients want; read_integers (5,), read_motion (6,): a read that may be torn;
-                     newest_integers, target, velocity: what the tick last read of it
+    commands         what clients want; read_integers (n, 5), read_motion (n, 6): a read that may be torn;
+                     newest_integers, target, velocity: what the tick last read of it; fresh (n,): 1 when that is new
     position, device, step, applied, device_force, previous_force, rendered_force  (n, 3), m and N, in the holders'
                      frames: where the tip is wanted, where the device is by that, and how far from the tick before,
                      where the tip is, the force, the one before, and the one that the device was rendering
@@ -138,6 +139,7 @@ class Memory(NamedTuple):
     read_integers: Integers
     read_motion: Floats
     newest_integers: Integers
+    fresh: Integers
     target: Floats
     velocity: Floats
     position: Floats
@@ -195,8 +197,8 @@ def make_memory(
     """A model at rest, with no command yet, whose first deadline is a period from now."""
     n = len(limits)
     period_ns = round(period_s * 1e9)
-    no_command = np.zeros((n, 5), np.int64)
-    no_command[:, SEQUENCE] = no_command[:, RENDERED_TICK] = -1
+    no_command = np.zeros((2, n, 5), np.int64)
+    no_command[..., SEQUENCE] = no_command[..., RENDERED_TICK] = -1
     shared = np.zeros(5, np.int64)
     shared[DEADLINE_NS] = time.monotonic_ns() + period_ns
     counters = np.zeros(9, np.int64)
@@ -220,12 +222,11 @@ def make_memory(
         rotation=np.tile(np.eye(3), (n, 1, 1)),
         frame_scale=np.ones(n),
         origin=np.zeros((n, 3)),
-        commands=Commands(
-            np.zeros(n, np.int64), np.zeros(n, np.int64), no_command, np.zeros((n, 3)), np.zeros((n, 3))
-        ),
-        read_integers=np.zeros(5, np.int64),
-        read_motion=np.zeros(6),
-        newest_integers=no_command.copy(),
+        commands=Commands(np.zeros(1, np.int64), np.zeros(n, np.int64), no_command, np.zeros((2, n, 6))),
+        read_integers=np.zeros((n, 5), np.int64),
+        read_motion=np.zeros((n, 6)),
+        newest_integers=no_command[NEWEST].copy(),
+        fresh=np.zeros(n, np.int64),
         target=np.zeros((n, 3)),
         velocity=np.zeros((n, 3)),
         position=np.zeros((n, 3)),

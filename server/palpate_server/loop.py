@@ -19,6 +19,7 @@ from typing import Any
 from numba import int32, types, uint64
 
 from palpate_server.atomics import (
+    MAX_READS,
     begin_read,
     begin_write,
     compare_and_swap,
@@ -44,6 +45,7 @@ from palpate_server.layout import (
     LEASE,
     LIMITS,
     LOCK,
+    NEWEST,
     NO_CHANGE,
     QUIET_TICKS,
     RENDERED_TICK,
@@ -51,6 +53,7 @@ from palpate_server.layout import (
     SEQUENCE,
     SHIFTED_AT,
     SKIPPED_TICKS,
+    STAGED,
     STOP,
     TAKEN,
     TICKS,
@@ -65,12 +68,39 @@ from palpate_server.layout import (
 from palpate_server.tick import count, has_faded, put_to_rest, run_tick
 
 MAX_CATCH_UP = 20
-_RETRIES = 100  # of a read that a writer disturbs
 _RETRY_NS = 20_000  # the deadline loop's nap while the other side runs the tick
 _PHASE_SHIFT_NS = 2_000  # the most that the deadlines move in a tick: 0.2 % of a millisecond
 _PHASE_GAIN = 16
 
 _eventfd_write: Any = types.ExternalFunction("eventfd_write", int32(int32, uint64))
+
+
+@compiled
+def stage_command(
+    commands: Commands,
+    contact: int,
+    sequence: int,
+    client_time_ns: int,
+    arrival_ns: int,
+    rendered_tick: int,
+    lease: int,
+    target: tuple[float, float, float],
+    velocity: tuple[float, float, float],
+) -> None:
+    """Have the displacement (m, finite) of a contact handed to the loop with the next `write_command`, in one act with it.
+
+    One thread at a time may call this. lease: commands.lease[contact], read before it was checked whether the client holds
+    the contact
+    """
+    integers, motion = commands.integers[STAGED, contact], commands.motion[STAGED, contact]
+    integers[SEQUENCE] = sequence
+    integers[CLIENT_TIME_NS] = client_time_ns
+    integers[ARRIVAL_NS] = arrival_ns
+    integers[RENDERED_TICK] = rendered_tick
+    integers[LEASE] = lease
+    for i in range(3):
+        motion[i] = target[i]
+        motion[3 + i] = velocity[i]
 
 
 @compiled
@@ -85,20 +115,18 @@ def write_command(
     target: tuple[float, float, float],
     velocity: tuple[float, float, float],
 ) -> None:
-    """Hand the newest displacement (m, finite) of a contact to the loop. One thread at a time may call this.
-
-    lease: commands.lease[contact], read before it was checked whether the client holds the contact
-    """
-    begin_write(commands.versions, contact)
-    commands.integers[contact, SEQUENCE] = sequence
-    commands.integers[contact, CLIENT_TIME_NS] = client_time_ns
-    commands.integers[contact, ARRIVAL_NS] = arrival_ns
-    commands.integers[contact, RENDERED_TICK] = rendered_tick
-    commands.integers[contact, LEASE] = lease
-    for i in range(3):
-        commands.target[contact, i] = target[i]
-        commands.velocity[contact, i] = velocity[i]
-    end_write(commands.versions, contact)
+    """Hand the newest displacement of a contact to the loop, and those that are staged: no tick comes in between."""
+    stage_command(
+        commands, contact, sequence, client_time_ns, arrival_ns, rendered_tick, lease, target, velocity
+    )
+    integers, motion = commands.integers, commands.motion
+    begin_write(commands.versions, 0)
+    for i in range(commands.lease.shape[0]):
+        if integers[STAGED, i, SEQUENCE] >= 0:
+            integers[NEWEST, i] = integers[STAGED, i]
+            motion[NEWEST, i] = motion[STAGED, i]
+            integers[STAGED, i, SEQUENCE] = -1
+    end_write(commands.versions, 0)
 
 
 @compiled
@@ -107,10 +135,10 @@ def forget_command(commands: Commands, contact: int) -> None:
 
     Nor is what the client may still have sent, and nobody has looked at yet, carried out.
     """
-    begin_write(commands.versions, contact)
+    begin_write(commands.versions, 0)
     commands.lease[contact] += 1
-    commands.integers[contact, SEQUENCE] = -1
-    end_write(commands.versions, contact)
+    commands.integers[NEWEST, contact, SEQUENCE] = -1
+    end_write(commands.versions, 0)
 
 
 @compiled
@@ -289,7 +317,7 @@ def records_written(shared: Integers) -> int:
 def read_snapshot(image: Image, state: Floats, displacement: Floats) -> int:
     """Copy the last snapshot of the model into `state` (order,) and `displacement` (n_contacts, 3), m; its tick, or -1."""
     m = view(image)
-    for _ in range(_RETRIES):
+    for _ in range(MAX_READS):
         version = begin_read(m.snapshot_version, 0)
         state[:] = m.snapshot_state
         displacement[:] = m.snapshot_displacement

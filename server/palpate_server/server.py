@@ -170,11 +170,13 @@ class Server:
             messages.refused[reason] += 1
             return
         messages.accepted += 1
+        *_, last = command.displacement_m
         for name, displacement in command.displacement_m.items():
             contact = service.contact_index[name]
             service.last_sequence[contact] = (lease[contact], command.sequence)
             messages.accepted_of[contact] += 1
-            loop.write_command(
+            hand_over = loop.write_command if name is last else loop.stage_command
+            hand_over(
                 service.memory.commands,
                 contact,
                 command.sequence,
@@ -384,6 +386,7 @@ def warm_up(period_s: float, n_contacts: int) -> None:
     )
     limits = [Limits(1.0, 1.0, 1.0, 1.0, 1.0)] * n_contacts
     memory = layout.make_memory(system, period_s, limits, 1 / USUAL_SURFACE_HZ)
+    loop.stage_command(memory.commands, 0, 1, 1, 1, -1, 0, wire.STILL, wire.STILL)
     loop.write_command(memory.commands, 0, 1, 1, 1, -1, 0, wire.STILL, wire.STILL)
     loop.forget_command(memory.commands, 0)
     image = make_image(memory)

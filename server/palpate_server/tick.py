@@ -7,7 +7,7 @@ while another model is faded in), the safety chain back to the device. Nothing h
 from __future__ import annotations
 
 from palpate_server import frames, kernel, safety
-from palpate_server.atomics import begin_read, begin_write, end_write, is_whole, store_release
+from palpate_server.atomics import MAX_READS, begin_read, begin_write, end_write, is_whole, store_release
 from palpate_server.clock import monotonic_ns
 from palpate_server.compiled import compiled
 from palpate_server.layout import (
@@ -32,6 +32,7 @@ from palpate_server.layout import (
     MAX_FORCE,
     MAX_FORCE_RATE,
     MAX_SPEED,
+    NEWEST,
     QUIET_TICKS,
     RECORDS,
     RENDERED_TICK,
@@ -48,7 +49,6 @@ from palpate_server.layout import (
 from palpate_server.safety import Flags
 
 _BIN_NS = 1_000  # of a histogram
-_RETRIES = 100  # of a read that a writer disturbs; afterwards the value before is used again
 
 # The tissue counts as at rest when every tip is at the undeformed surface and the model's force is not above this for so
 # many ticks; its state is then put to zero exactly, which also keeps it from decaying into slow denormal numbers.
@@ -72,7 +72,7 @@ def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
     period = m.period_ns[0]
     period_s = period * 1e-9
     tick = m.counters[TICKS]
-    row = tick % m.record_times.shape[0]
+    row = tick % RECORDS
     n_contacts = m.applied.shape[0]
 
     lateness = start - deadline
@@ -85,8 +85,8 @@ def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
         m.counters[CAUGHT_UP_TICKS] += 1
     count(m, TICK_LATENESS, lateness)
 
+    _read_commands(m)
     for i in range(n_contacts):
-        fresh = _read_command(m, i)
         integers = m.newest_integers[i]
         known = integers[SEQUENCE] >= 0
         # A command may come between the start of the tick and here.
@@ -95,10 +95,10 @@ def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
         flags = tick_flags
         if known:
             m.tallies[i, COMMANDED_TICKS] += 1
-            if fresh:
+            if m.fresh[i]:
                 m.tallies[i, FRESH_TICKS] += 1
         if live:
-            if not fresh:
+            if not m.fresh[i]:
                 flags |= _HELD
             count(m, INPUT_AGE, age)
             safety.reconstruct(m.target[i], m.velocity[i], age, m.position[i])
@@ -176,8 +176,8 @@ def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
         for j in range(3):
             force[j] *= m.scale[i]
         rendered_tick = m.newest_integers[i, RENDERED_TICK]
-        told = 0 <= rendered_tick < tick and tick - rendered_tick < m.record_times.shape[0]
-        rendered = m.record_motion[(rendered_tick if told else tick - 1) % m.record_times.shape[0], i]
+        told = 0 <= rendered_tick < tick and tick - rendered_tick < RECORDS
+        rendered = m.record_motion[(rendered_tick if told else tick - 1) % RECORDS, i]
         for j in range(3):
             m.rendered_force[i, j] = rendered[3 + j]
         m.energy[i], limited = safety.keep_passive(
@@ -249,33 +249,30 @@ def _settle(m: Memory, tick: int) -> None:
 
 
 @compiled
-def _read_command(m: Memory, contact: int) -> bool:
-    """Take the newest command of a contact from its slot; True when it is another one than before.
+def _read_commands(m: Memory) -> None:
+    """Take the newest command of every contact from its slot, and note which are others than before.
 
-    A writer that is interrupted in the middle can't hold the loop up: after some tries the value before stays.
+    A writer that is interrupted in the middle can't hold the loop up: after some tries the commands before stay.
     """
     commands = m.commands
-    before = m.newest_integers[contact, SEQUENCE]
-    for _ in range(_RETRIES):
-        version = begin_read(commands.versions, contact)
-        for i in range(5):
-            m.read_integers[i] = commands.integers[contact, i]
-        if m.read_integers[LEASE] != commands.lease[contact]:
-            m.read_integers[
-                SEQUENCE
-            ] = -1  # checked while its client held the contact, written when it no longer did
-        for i in range(3):
-            m.read_motion[i] = commands.target[contact, i]
-            m.read_motion[3 + i] = commands.velocity[contact, i]
-        if is_whole(commands.versions, contact, version):
-            sequence = m.read_integers[SEQUENCE]
-            m.newest_integers[contact] = m.read_integers
-            if sequence >= 0:
-                for i in range(3):
-                    m.target[contact, i] = m.read_motion[i]
-                    m.velocity[contact, i] = m.read_motion[3 + i]
-            return sequence != before
-    return False
+    m.fresh[:] = 0
+    for _ in range(MAX_READS):
+        version = begin_read(commands.versions, 0)
+        m.read_integers[:] = commands.integers[NEWEST]
+        m.read_motion[:] = commands.motion[NEWEST]
+        for i in range(m.fresh.shape[0]):
+            if m.read_integers[i, LEASE] != commands.lease[i]:
+                # Checked while its client held the contact, written when it no longer did.
+                m.read_integers[i, SEQUENCE] = -1
+        if is_whole(commands.versions, 0, version):
+            for i in range(m.fresh.shape[0]):
+                sequence = m.read_integers[i, SEQUENCE]
+                m.fresh[i] = sequence != m.newest_integers[i, SEQUENCE]
+                m.newest_integers[i] = m.read_integers[i]
+                if sequence >= 0:
+                    m.target[i] = m.read_motion[i, 0:3]
+                    m.velocity[i] = m.read_motion[i, 3:6]
+            return
 
 
 @compiled

@@ -13,7 +13,8 @@ from numba import njit
 
 from palpate.model import ReducedModel, StateSpace
 from palpate_server import atomics, layout, loop, safety
-from palpate_server.image import make_image
+from palpate_server.clock import monotonic_ns
+from palpate_server.image import Image, make_image
 from palpate_server.safety import Flags, Limits
 
 FREE = Limits(1e6, 1e12, 1e6, 1e6, 0.0)  # limits that nothing here reaches
@@ -642,9 +643,9 @@ def _count_torn(commands: layout.Commands, n: int) -> tuple[int, int]:
     torn = whole = 0
     for _ in range(n):
         version = atomics.begin_read(commands.versions, 0)
-        sequence = commands.integers[0, 0]
-        arrival = commands.integers[0, 2]
-        x, z = commands.target[0, 0], commands.target[0, 2]
+        sequence = commands.integers[layout.NEWEST, 0, 0]
+        arrival = commands.integers[layout.NEWEST, 0, 2]
+        x, z = commands.motion[layout.NEWEST, 0, 0], commands.motion[layout.NEWEST, 0, 2]
         if atomics.is_whole(commands.versions, 0, version):
             whole += 1
             if not (sequence == arrival and x == z and x == float(sequence)):
@@ -664,6 +665,68 @@ def test_a_reader_never_sees_half_a_command(memory: layout.Memory) -> None:
     writer.join()
     assert whole > 1000
     assert torn == 0
+
+
+@njit(nogil=True)
+def _write_to_both(commands: layout.Commands, n: int) -> None:
+    for i in range(n):
+        now = monotonic_ns()
+        there = (0.0, 0.0, 1e-3 * (i % 2))
+        loop.stage_command(commands, 1, i, 7, now, -1, 0, there, there)
+        loop.write_command(commands, 0, i, 7, now, -1, 0, there, there)
+
+
+@njit(nogil=True)
+def _run_ticks(image: Image, n: int) -> None:
+    for _ in range(n):
+        loop.repeat_tick(image, monotonic_ns())
+
+
+def test_no_tick_comes_between_two_contacts_of_a_command(
+    make_spring_mass_model: Callable[..., ReducedModel],
+) -> None:
+    model = make_spring_mass_model(2)
+    memory = layout.make_memory(model.discrete, model.period_s, [FREE, FREE], 1 / 30)
+    image = make_image(memory)
+    _write_to_both(memory.commands, 1)
+    _run_ticks(image, 1)
+    writer = threading.Thread(target=_write_to_both, args=(memory.commands, 2_000_000))
+    writer.start()
+    seen = set()
+    while writer.is_alive():
+        _run_ticks(image, 1000)
+        rows = (loop.records_written(memory.shared) - 1 - np.arange(1000)) % layout.RECORDS
+        sequences = memory.record_inputs[rows, :, layout.SEQUENCE]
+        np.testing.assert_array_equal(sequences[:, 0], sequences[:, 1])
+        np.testing.assert_array_equal(memory.newest_integers[0], memory.newest_integers[1])
+        np.testing.assert_array_equal(memory.target[0], memory.target[1])
+        seen |= set(sequences[:, 0].tolist())
+    writer.join()
+    assert len(seen) > 100
+
+
+def test_a_command_that_is_staged_waits_for_the_rest_and_for_a_lease_that_still_holds(
+    make_spring_mass_model: Callable[..., ReducedModel],
+) -> None:
+    model = make_spring_mass_model(2)
+    memory = layout.make_memory(model.discrete, model.period_s, [FREE, FREE], 1 / 30)
+    image, still = make_image(memory), (0.0, 0.0, 0.0)
+
+    def sequences() -> list[int]:
+        loop.repeat_tick(image, time.monotonic_ns())
+        row = (loop.records_written(memory.shared) - 1) % layout.RECORDS
+        return list(memory.record_inputs[row, :, layout.SEQUENCE])
+
+    loop.stage_command(memory.commands, 0, 1, 7, 1, -1, 0, still, still)
+    assert sequences() == [-1, -1]
+    loop.write_command(memory.commands, 1, 1, 7, 1, -1, 0, still, still)
+    assert sequences() == [1, 1]
+    loop.write_command(memory.commands, 1, 2, 7, 1, -1, 0, still, still)
+    assert sequences() == [1, 2]  # what was staged once is handed over once
+    loop.stage_command(memory.commands, 0, 3, 7, 1, -1, 0, still, still)
+    loop.forget_command(memory.commands, 0)
+    loop.write_command(memory.commands, 1, 3, 7, 1, -1, 0, still, still)
+    assert sequences() == [-1, 3]
 
 
 def test_a_snapshot_belongs_to_one_tick(make_spring_mass_model: Callable[..., ReducedModel]) -> None:
