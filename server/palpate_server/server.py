@@ -155,8 +155,7 @@ class Server:
         payload = sample.payload
         key = str(sample.key_expr)
         try:
-            if len(payload) > wire.MAX_COMMAND_BYTES:
-                raise wire.MalformedMessage("too_large", f"payload has {len(payload)} bytes")
+            wire.check_size(len(payload), wire.MAX_COMMAND_BYTES)
             content = payload.to_bytes()
             if (recorder := service.recorder) is not None:
                 recorder.command(key, content)
@@ -296,6 +295,13 @@ class Server:
 
     def _queue_query(self, answer: Callable[[zenoh.Query], None]) -> Callable[[zenoh.Query], None]:
         def take(query: zenoh.Query) -> None:
+            try:
+                if query.payload is not None:  # a large one is not left waiting: many would take much room
+                    wire.check_size(len(query.payload), wire.MAX_REQUEST_BYTES)
+            except wire.MalformedMessage as error:
+                with query:
+                    _refuse(query, error.reason, str(error))
+                return
             if self._events.qsize() < MAX_WAITING:
                 self._queue(_QUERIES, lambda: answer(query))
             else:
@@ -415,8 +421,6 @@ def _request(query: zenoh.Query) -> dict[str, Any]:
     payload = query.payload
     if payload is None:
         return {}
-    if len(payload) > wire.MAX_REQUEST_BYTES:
-        raise wire.MalformedMessage("too_large", f"payload has {len(payload)} bytes")
     return wire.unpack_map(payload.to_bytes(), wire.MAX_REQUEST_BYTES)
 
 

@@ -11,9 +11,10 @@ import zenoh
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LEASE_MS = 1000  # after which a peer that does not answer counts as gone
-# The largest message that a server puts together from fragments; its clients have nothing to say that takes a quarter
-# of it. Zenoh drops a larger one and keeps the link; of itself it would collect up to 1 GiB for each client and priority.
-MAX_MESSAGE_BYTES = 65536
+# The largest message that a server puts together from fragments. Its clients have nothing to say that takes a thousandth
+# of it: it is so large that what they send by mistake arrives, and is counted. What is larger still Zenoh drops before it
+# is collected, and keeps the link; of itself it would collect up to 1 GiB for each client and priority.
+MAX_MESSAGE_BYTES = 2**24
 
 _QUIET: dict[str, Any] = {
     "mode": "peer",

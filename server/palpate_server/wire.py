@@ -151,8 +151,7 @@ def pack(message: Mapping[str, Any]) -> bytes:
 
 def unpack_map(payload: bytes, max_bytes: int) -> dict[str, Any]:
     """Read a map with string keys, bounded in size before anything is decoded. Raises MalformedMessage."""
-    if len(payload) > max_bytes:
-        raise MalformedMessage("too_large", f"payload has {len(payload)} bytes: expected at most {max_bytes}")
+    check_size(len(payload), max_bytes)
     try:
         message = msgpack.unpackb(payload, raw=False, strict_map_key=True)
     except (ValueError, RecursionError, OverflowError) as error:
@@ -162,6 +161,12 @@ def unpack_map(payload: bytes, max_bytes: int) -> dict[str, Any]:
     if type(message) is not dict:
         raise MalformedMessage("not_a_map", f"payload is a {type(message).__name__}: expected a map")
     return message
+
+
+def check_size(n_bytes: int, max_bytes: int) -> None:
+    """Raises MalformedMessage when a payload is larger than it may be: to be asked before it is copied or decoded."""
+    if n_bytes > max_bytes:
+        raise MalformedMessage("too_large", f"payload has {n_bytes} bytes: expected at most {max_bytes}")
 
 
 def decode_command(payload: bytes) -> Command:

@@ -209,23 +209,36 @@ def test_ten_thousand_malformed_messages_leave_the_server_ticking(
         assert granted
         payloads = malformed_payloads(10_000)
         before = client.next_status()
-        client.put(bytes(10_000_000))  # the server's session drops it: not even counted, and the link stays
+        client.put(bytes(10_000_000))  # larger than anything it reads, not too large to be counted
         for payload in payloads:
             client.put(payload)
 
         def counted(status: dict[str, Any]) -> int:
             return sum(status["refused"].values()) + sum(status["malformed"].values())
 
-        wait_until(lambda: counted(client.statuses[-1]) - counted(before) == len(payloads), 60)
+        wait_until(lambda: counted(client.statuses[-1]) - counted(before) == len(payloads) + 1, 60)
         after = client.next_status()
         assert after["accepted"] == before["accepted"]
-        assert after["malformed"]["too_large"] == 1000
+        assert after["malformed"]["too_large"] == 1001
         assert after["refused"]["not_finite"] == 2000
         assert after["faults"] == 0
         assert after["ticks"] > before["ticks"]
 
         sequence = client.command({"tip": [0.0, 0.0, -1e-3]})
         wait_until(lambda: client.forces[-1]["sequence"][0] == sequence)
+
+
+@pytest.mark.parametrize("size", [20_000, 10_000_000])
+def test_a_request_that_is_too_large_is_refused_before_it_is_read(
+    serve: Callable[..., Any], connect: Callable[..., Any], size: int
+) -> None:
+    served = serve()
+    with connect(served.endpoint) as client:
+        granted, refusal = client.control("acquire", {"contacts": ["tip"], "remark": "x" * size})
+        assert not granted
+        assert refusal["reason"] == "too_large"
+        assert "expected at most 16384" in refusal["message"]
+        assert client.acquire("tip")[0]
 
 
 def test_old_sequences_and_others_contacts_are_refused(
