@@ -3,7 +3,8 @@
     palpate replay RECORDING.mcap MODEL.npz
 
 What is repeated begins where everything is known to be at rest, and breaks off where a message was lost that can't be
-done without, the model was reset or another one loaded; from the next rest on it is repeated again.
+done without (a status that may have told of other limits is one), the model was reset or another one loaded; from the
+next rest on it is repeated again.
 
 Exit code 0: every tick that a status tells of was repeated and gave the recorded displacement and force exactly. 3: all
 that could be repeated did, but not all could be. 1: a tick gave another displacement or force. 2: nothing can be replayed.
@@ -12,6 +13,7 @@ that could be repeated did, but not all could be. 1: a tick gave another displac
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import struct
 import sys
@@ -40,7 +42,14 @@ from palpate_server.safety import Flags, Limits
 
 _MAGIC = b"\x89MCAP0\r\n"  # an MCAP file begins with it
 _OF_THE_TICK = int(Flags.LATE | Flags.CAUGHT_UP)  # depend on the machine, not on the model
-_NEEDED = {"ticks", "at_rest_since_tick", "undisturbed_since_tick", "model", "contacts"}  # of a status
+_NEEDED = {
+    "number",
+    "ticks",
+    "at_rest_since_tick",
+    "undisturbed_since_tick",
+    "model",
+    "contacts",
+}  # of a status
 _LIMITED = int(Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED)
 # So far from their place in time commands and forces may stand in a recording: twice what the server sends late.
 _OUT_OF_ORDER_TICKS = 200
@@ -164,6 +173,7 @@ def compare(session: Session, model: ReducedModel) -> Comparison:
             "the tissue was never at rest in this recording: start it before the first command, or reset the model first"
         )
     disturbed = {status["undisturbed_since_tick"] for status in session.statuses}
+    untold = _untold(session)
     told_until = max(status["ticks"] for status in session.statuses)  # a change after it would be unheard of
     forces = [message for message in session.forces if message["tick"] < told_until]
     of = forces[-1]["tick"] + 1 - forces[0]["tick"]
@@ -175,6 +185,9 @@ def compare(session: Session, model: ReducedModel) -> Comparison:
     difference = None
     for k, message in enumerate(forces):
         tick = message["tick"]
+        if tick in untold:
+            memory = None
+            continue
         if tick in disturbed or (k > 0 and tick != forces[k - 1]["tick"] + 1):
             memory = None
         commands = used.by(k)
@@ -240,6 +253,18 @@ def _memory_at_rest(session: Session, model: ReducedModel, k: int) -> layout.Mem
     for message in session.forces[max(0, k - layout.RECORDS + 1) : k]:
         memory.record_motion[message["tick"] % layout.RECORDS, :, 3:6] = message["force_n"]
     return memory
+
+
+def _untold(session: Session) -> Set[int]:
+    """Ticks in which something may have been agreed, reset or loaded that only a missing status told of."""
+    ticks: set[int] = set()
+    for before, after in itertools.pairwise(session.statuses):
+        if after["number"] != before["number"] + 1:
+            contacts = after["contacts"].values()
+            last = max(after["undisturbed_since_tick"], *(state["since_tick"] for state in contacts))
+            # What is agreed is told a little later than it holds.
+            ticks.update(range(before["ticks"] - _OUT_OF_ORDER_TICKS, last))
+    return ticks
 
 
 class _Terms:

@@ -48,6 +48,7 @@ class Service:
         self.stopping = threading.Event()
         self.undisturbed_since_tick = 0
         self.lost_clients = 0
+        self._statuses = 0
         self.recorder: Recorder | None = None
         self.model_in_use = threading.Lock()
         self._changing = threading.Lock()  # the loop has one slot for changes
@@ -71,7 +72,10 @@ class Service:
             return tick
 
     def status(self) -> dict[str, Any]:
+        """The next status message; one thread at a time may call this."""
+        self._statuses += 1
         return telemetry.status(
+            self._statuses,
             self.state,
             time.monotonic_ns(),
             self.model,

@@ -79,6 +79,7 @@ def success_rate(memory: layout.Memory, contact: int) -> float | None:
 
 
 def status(
+    number: int,
     state: str,
     server_time_ns: int,
     model: ReducedModel,
@@ -89,7 +90,7 @@ def status(
     lost_clients: int,
     recording: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """The status message; `state` is "running" or "stopping", `recording` what its recorder reports."""
+    """The status message, the so many-th; `state` is "running" or "stopping", `recording` what its recorder reports."""
     ticks = memory.counters.tolist()
     durations = {
         "timer_lateness_s": layout.TIMER_LATENESS,
@@ -98,6 +99,7 @@ def status(
         "input_age_s": layout.INPUT_AGE,
     }
     return {
+        "number": number,
         "state": state,
         "server_time_ns": server_time_ns,
         "model": {"name": model.name, "order": model.order, "config_sha256": model.config_sha256},

@@ -20,6 +20,7 @@ from palpate_server.recording import Recording
 from palpate_server.safety import HOLD_NS, Flags, Limits
 
 CEILING = Limits(10.0, 2000.0, 1.0, 0.1, 5.0)
+OBSERVED = CEILING._replace(max_damping_n_s_per_m=0.0)  # no passivity control
 SHIFTED = Frame(((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), 2.0, (0.01, -0.02, 0.03))
 
 
@@ -35,6 +36,7 @@ class Recorded:
         self.sequence = 0
         self.constant_time = False  # of the client
         self.undisturbed_since = 0
+        self.statuses = 0
         self.terms: dict[str, Any] = {
             "limits": CEILING,
             "frame": IDENTITY,
@@ -138,8 +140,10 @@ class Recorded:
 
     def say_status(self) -> None:
         told = {"limits": self.terms["limits"]._asdict(), "frame": asdict(self.terms["frame"])}
+        self.statuses += 1
         self.session.statuses.append(
             {
+                "number": self.statuses,
                 "ticks": self.tick,
                 "at_rest_since_tick": self.at_rest_since,
                 "undisturbed_since_tick": self.undisturbed_since,
@@ -257,6 +261,50 @@ def test_a_reset_breaks_it_off_until_the_next_rest(recorded: Recorded) -> None:
     assert replay.compare(recorded.session, recorded.model) == expected
 
 
+@pytest.mark.parametrize("lost", [0, 1])
+def test_where_a_missing_status_may_have_told_of_other_limits_nothing_is_repeated(
+    recorded: Recorded, lost: int
+) -> None:
+    tighter = [OBSERVED._replace(max_force_n=largest) for largest in (0.02, 0.01)]
+    recorded.agree(OBSERVED)
+    recorded.run(450, commanded=True)
+    for limits in tighter:
+        recorded.agree(limits)
+        recorded.run(30, commanded=True)
+        recorded.say_status()
+    recorded.run(390, commanded=True)
+    statuses = recorded.session.statuses
+    if lost:
+        (first_of_them,) = [status for status in statuses if status["ticks"] == 580]
+        statuses.remove(first_of_them)
+        expected = repeated(recorded.session, range(300), of=1000)
+    else:
+        expected = repeated(recorded.session, range(1000))
+    assert replay.compare(recorded.session, recorded.model) == expected
+
+
+def test_a_missing_status_with_nothing_new_breaks_nothing_off(recorded: Recorded) -> None:
+    recorded.run(900, commanded=True)
+    del recorded.session.statuses[3:6]
+    assert replay.compare(recorded.session, recorded.model) == repeated(recorded.session, range(1000))
+
+
+def test_a_reset_that_a_missing_status_told_of_may_not_have_been_the_only_one(recorded: Recorded) -> None:
+    recorded.run(600, commanded=True)
+    recorded.reset()
+    recorded.run(50, commanded=True)
+    recorded.say_status()
+    recorded.reset()
+    recorded.run(50, commanded=True)
+    recorded.come_to_rest()
+    rest = recorded.at_rest_since
+    recorded.run(400 - recorded.tick % 100, commanded=True)
+    told = [status["number"] for status in recorded.session.statuses if status["ticks"] == 750]
+    recorded.session.statuses = [s for s in recorded.session.statuses if s["number"] not in told]
+    expected = repeated(recorded.session, range(500), range(rest, recorded.tick), of=recorded.tick)
+    assert replay.compare(recorded.session, recorded.model) == expected
+
+
 def test_the_ticks_of_another_model_are_left_out(recorded: Recorded) -> None:
     recorded.run(300, commanded=True)
     recorded.come_to_rest()
@@ -293,9 +341,6 @@ def test_a_force_that_the_device_was_rendering_before_the_stretch_counts_in_its_
 def test_what_was_not_told_any_more_is_not_repeated(recorded: Recorded) -> None:
     recorded.run(250, commanded=True)
     assert replay.compare(recorded.session, recorded.model) == repeated(recorded.session, range(300))
-
-
-OBSERVED = CEILING._replace(max_damping_n_s_per_m=0.0)  # no passivity control
 
 
 def test_a_missing_command_is_counted_only_while_it_was_in_use(recorded: Recorded) -> None:

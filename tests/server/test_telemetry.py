@@ -56,5 +56,7 @@ def test_the_status_message_is_plain_data(make_spring_mass_model: Callable[..., 
     limits = Limits(1.0, 1.0, 1.0, 1.0, 0.0)
     memory = layout.make_memory(model.discrete, model.period_s, [limits] * 2, 1 / 30)
     leases = Leases(["tip", "tip1"], limits)
-    message = telemetry.status("running", 5, model, memory, telemetry.MessageCounters(1), leases, 0, 0, None)
+    message = telemetry.status(
+        1, "running", 5, model, memory, telemetry.MessageCounters(1), leases, 0, 0, None
+    )
     assert msgpack.unpackb(msgpack.packb(message))["contacts"]["tip1"]["holder"] is None
