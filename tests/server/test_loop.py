@@ -668,8 +668,8 @@ def test_a_reader_never_sees_half_a_command(memory: layout.Memory) -> None:
 
 
 @njit(nogil=True)
-def _write_to_both(commands: layout.Commands, n: int) -> None:
-    for i in range(n):
+def _write_to_both(commands: layout.Commands, first: int, stop: int) -> None:
+    for i in range(first, stop):
         now = monotonic_ns()
         there = (0.0, 0.0, 1e-3 * (i % 2))
         loop.stage_command(commands, 1, i, 7, now, -1, 0, there, there)
@@ -688,12 +688,22 @@ def test_no_tick_comes_between_two_contacts_of_a_command(
     model = make_spring_mass_model(2)
     memory = layout.make_memory(model.discrete, model.period_s, [FREE, FREE], 1 / 30)
     image = make_image(memory)
-    _write_to_both(memory.commands, 1)
+    _write_to_both(memory.commands, 0, 1)
     _run_ticks(image, 1)
-    writer = threading.Thread(target=_write_to_both, args=(memory.commands, 2_000_000))
+    enough = threading.Event()
+
+    def write() -> None:
+        first = 1
+        while not enough.is_set():
+            _write_to_both(memory.commands, first, first + 10_000)
+            first += 10_000
+
+    writer = threading.Thread(target=write, daemon=True)
     writer.start()
-    seen = set()
-    while writer.is_alive():
+    seen: set[int] = set()
+    give_up = time.monotonic() + 60
+    while len(seen) < 1000:
+        assert time.monotonic() < give_up
         _run_ticks(image, 1000)
         rows = (loop.records_written(memory.shared) - 1 - np.arange(1000)) % layout.RECORDS
         sequences = memory.record_inputs[rows, :, layout.SEQUENCE]
@@ -701,8 +711,8 @@ def test_no_tick_comes_between_two_contacts_of_a_command(
         np.testing.assert_array_equal(memory.newest_integers[0], memory.newest_integers[1])
         np.testing.assert_array_equal(memory.target[0], memory.target[1])
         seen |= set(sequences[:, 0].tolist())
+    enough.set()
     writer.join()
-    assert len(seen) > 100
 
 
 def test_a_command_that_is_staged_waits_for_the_rest_and_for_a_lease_that_still_holds(
