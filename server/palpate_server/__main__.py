@@ -9,7 +9,6 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 # The loop's process has no use for a pool of linear algebra threads; to be said before numpy is loaded.
@@ -19,7 +18,7 @@ import zenoh
 
 from palpate.model import ModelFileError, load_model
 from palpate_server import transport, wire
-from palpate_server.arguments import index, positive
+from palpate_server.arguments import index, need, positive
 from palpate_server.safety import Limits, least_force_rate
 from palpate_server.server import FASTEST_SURFACE_HZ, USUAL_SURFACE_HZ, serve
 
@@ -58,8 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.black_box is not None:
             _prepare_folder("--black-box", options.black_box)
         if options.recordings is not None:
-            if find_spec("mcap") is None:
-                raise ValueError("--recordings needs the package mcap: install palpate[recorder]")
+            need("mcap", "recorder", "palpate serve --recordings")
             _prepare_folder("--recordings", options.recordings)
         with transport.open_session(options.listen, options.zenoh_config) as session:
             where = options.zenoh_config or options.listen
