@@ -1,4 +1,7 @@
-"""A real server in a process of its own, on loopback and a free port, ended whatever happens."""
+"""Programs as a user runs them, each a process on loopback that ends with its test, and a client to watch them with.
+
+Nothing here counts on a quick machine: a wait is for what is to happen, never for a time in which it usually has.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -22,83 +26,239 @@ import zenoh
 
 from palpate.model import ReducedModel, save_model
 from palpate_server.round_trips import free_endpoint
+from palpate_server.sample_model import spring_mass_model
 
 EXAMPLES = Path(__file__).parents[2] / "client_examples"
-START_S = 60.0  # the first start compiles
 SESSION = "test"
+PATIENCE_S = 60.0  # what is waited for comes much sooner; a busy machine may take its time
+START_S = 240.0  # the first start compiles
+
+
+def wait_for(
+    look: Callable[[], Any],
+    what: str,
+    condition: Callable[[Any], object] = bool,
+    seconds: float = PATIENCE_S,
+) -> Any:
+    """What `look` returns as soon as that meets the condition."""
+    give_up = time.monotonic() + seconds
+    while not condition(seen := look()):
+        assert time.monotonic() < give_up, f"waited {seconds:g} s for {what}; last seen: {seen!r}"
+        time.sleep(0.005)
+    return seen
+
+
+# Programs
+
+
+@dataclass
+class Program:
+    """Python in a process of its own; what it prints goes to two files."""
+
+    process: subprocess.Popen[bytes]
+    out: Path
+    err: Path
+
+    def printed(self) -> str:
+        return self.out.read_text() + self.err.read_text()
+
+    def finish(self) -> tuple[int, str, str]:
+        """Its exit code, standard output and standard error, once it has ended by itself."""
+        code = wait_for(
+            lambda: (self.process.poll(), self.printed()),
+            f"the end of {self.process.args}",
+            lambda seen: seen[0] is not None,
+        )[0]
+        err = self.err.read_text()
+        assert "Traceback" not in err, err
+        return code, self.out.read_text(), err
+
+    def stop(self, number: int = signal.SIGTERM) -> int:
+        self.process.send_signal(number)
+        return self.finish()[0]
+
+
+@contextmanager
+def _programs(folder: Path) -> Iterator[Callable[..., Program]]:
+    """Starts programs, and ends those that still run."""
+    started: list[Program] = []
+
+    def start(*arguments: str | Path, ready: str = "", cwd: Path | None = None) -> Program:
+        """With `ready` it returns when a line has been printed that begins with it."""
+        out, err = (folder / f"{len(started)}.{stream}" for stream in ("out", "err"))
+        with out.open("wb") as stdout, err.open("wb") as stderr:
+            process = subprocess.Popen(
+                [sys.executable, *map(str, arguments)], stdout=stdout, stderr=stderr, cwd=cwd
+            )
+        program = Program(process, out, err)
+        started.append(program)
+
+        def seen() -> tuple[bool, int | None, str]:
+            ended = process.poll()  # before the look at what it printed by then
+            is_ready = any(line.startswith(ready) for line in out.read_text().splitlines())
+            return is_ready, ended, program.printed()
+
+        if ready:
+            is_ready, code, printed = wait_for(
+                seen, f"the line {ready!r} of {process.args}", lambda it: it[0] or it[1] is not None, START_S
+            )
+            assert is_ready, f"{process.args} has ended with code {code}: {printed}"
+        return program
+
+    try:
+        yield start
+    finally:
+        for program in started:
+            program.process.kill()
+        for program in started:
+            program.process.wait()
+
+
+@pytest.fixture
+def start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Program]]:
+    """start(*arguments of Python, ready="", cwd=None) -> Program"""
+    with _programs(tmp_path_factory.mktemp("programs")) as start:
+        yield start
+
+
+@pytest.fixture(scope="module")
+def start_for_module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Program]]:
+    """As `start`, of programs that several tests share."""
+    with _programs(tmp_path_factory.mktemp("programs")) as start:
+        yield start
 
 
 @dataclass
 class ServedModel:
     """A server that is running."""
 
-    process: subprocess.Popen[str]
+    program: Program
     endpoint: str
     model: ReducedModel
-    before: list[str]
+
+    @property
+    def process(self) -> subprocess.Popen[bytes]:
+        return self.program.process
 
     def stop(self, number: int = signal.SIGTERM) -> int:
-        self.process.send_signal(number)
-        return self.process.wait(20)
+        return self.program.stop(number)
 
-    def output(self) -> str:
-        """What it printed since it was serving, after its end; also what it printed before, on the way there."""
-        assert self.process.stdout is not None
-        return "".join(self.before) + self.process.stdout.read()
+
+def _serve(
+    start: Callable[..., Program],
+    folder: Path,
+    *options: str,
+    n_contacts: int = 1,
+    n_modes: int = 20,
+    listen: bool = True,
+) -> ServedModel:
+    """A server of its own for the file model{n_contacts}.npz in a folder. Without `listen` the options say where."""
+    model = spring_mass_model(n_contacts, n_modes)
+    path = folder / f"model{n_contacts}.npz"
+    save_model(model, path)
+    endpoint = free_endpoint()
+    place = ("--listen", endpoint) if listen else ()
+    command = ("-m", "palpate_server", path, *place, "--session", SESSION, *options)
+    return ServedModel(start(*command, ready="serving"), endpoint, model)
+
+
+@pytest.fixture
+def serve(start: Callable[..., Program], tmp_path: Path) -> Callable[..., ServedModel]:
+    """serve(*options, n_contacts=1, n_modes=20, listen=True) -> ServedModel"""
+    return partial(_serve, start, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def serve_for_module(
+    start_for_module: Callable[..., Program], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[..., ServedModel]:
+    """As `serve`, of a server that several tests share: none of them may change what another looks at."""
+    return partial(_serve, start_for_module, tmp_path_factory.mktemp("served"))
+
+
+@pytest.fixture
+def run_example(start: Callable[..., Program]) -> Callable[..., Program]:
+    """run_example(script, endpoint, *options) -> Program"""
+
+    def run(script: str | Path, endpoint: str, *options: str) -> Program:
+        patient = ("--silence-s", "30")  # a busy machine is no reason to let go
+        return start(EXAMPLES / script, "--connect", endpoint, "--session", SESSION, *patient, *options)
+
+    return run
+
+
+@pytest.fixture(name="wait_for")
+def _wait_for() -> Callable[..., Any]:
+    """wait_for(look, what, condition=bool, seconds=60.0)"""
+    return wait_for
+
+
+# The client
 
 
 @dataclass
 class RawClient:
-    """A client that can misbehave: it sends any bytes, and keeps whatever comes."""
+    """A client that can misbehave: it sends any bytes, and keeps whatever comes.
 
-    endpoint: str
+    place: an endpoint, or a file with a Zenoh configuration
+    """
+
+    place: str | Path
     name: str = field(default_factory=lambda: f"test-{uuid.uuid4().hex[:8]}")
+    server: str = SESSION
     forces: list[dict[str, Any]] = field(default_factory=list)
     statuses: list[dict[str, Any]] = field(default_factory=list)
     sequence: int = 0
 
     def __enter__(self) -> RawClient:
-        config = zenoh.Config()
-        for key, value in {
-            "mode": "peer",
-            "listen/endpoints": [],
-            "connect/endpoints": [self.endpoint],
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": False,
-        }.items():
-            config.insert_json5(key, json.dumps(value))
-        self.session = zenoh.open(config)
-        self.token = self.session.liveliness().declare_token(f"palpate/{SESSION}/client/{self.name}")
-        self._subscribers = [
-            self.session.declare_subscriber(
-                f"palpate/{SESSION}/{key}", lambda s, to=to: to.append(msgpack.unpackb(s.payload.to_bytes()))
-            )
-            for key, to in (("force", self.forces), ("status", self.statuses))
-        ]
-        wait_for(lambda: self.forces and self.statuses, "forces and statuses")
+        self.open()
+        try:
+            wait_for(lambda: (len(self.forces), len(self.statuses)), "forces and statuses", all)
+        except BaseException:
+            self.close()
+            raise
         return self
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self.close()
+
+    def open(self) -> None:
+        self.session = zenoh.open(_configuration(self.place))
+        self.token = self.session.liveliness().declare_token(self.key(f"client/{self.name}"))
+        self._subscribers = [
+            self.session.declare_subscriber(
+                self.key(key), lambda s, to=to: to.append(msgpack.unpackb(s.payload.to_bytes()))
+            )
+            for key, to in (("force", self.forces), ("status", self.statuses))
+        ]
+
+    def close(self) -> None:
+        """Without it the tests would hang at their end."""
         self.session.close()
 
+    def key(self, rest: str) -> str:
+        return f"palpate/{self.server}/{rest}"
+
     def query(self, key: str, request: object = None) -> tuple[bool, dict[str, Any]]:
-        """Whether it was granted, and the answer."""
+        """Whether it was granted, and the server's answer. Raises TimeoutError when the server gives none."""
         payload = None if request is None else msgpack.packb(request)
-        for reply in self.session.get(f"palpate/{SESSION}/{key}", payload=payload, timeout=5.0):
+        for reply in self.session.get(self.key(key), payload=payload, timeout=PATIENCE_S):
             result = reply.ok or reply.err
             assert result is not None
-            return reply.ok is not None, msgpack.unpackb(result.payload.to_bytes())
-        raise AssertionError(f"no answer to {key}")
-
-    def acquire(self, *contacts: str) -> tuple[bool, dict[str, Any]]:
-        return self.control("acquire", {"contacts": list(contacts)})
+            if str(result.encoding).startswith("application/msgpack"):  # or the words are Zenoh's
+                return reply.ok is not None, msgpack.unpackb(result.payload.to_bytes())
+        raise TimeoutError(f"no answer to {key}")
 
     def control(self, action: str, request: object = None) -> tuple[bool, dict[str, Any]]:
         return self.query(f"control/{self.name}/{action}", request)
 
+    def acquire(self, *contacts: str) -> tuple[bool, dict[str, Any]]:
+        return self.control("acquire", {"contacts": list(contacts)})
+
     def put(self, payload: bytes) -> None:
+        """To the server's commands. None is dropped, and they arrive in order, but when they do nobody says."""
         self.session.put(
-            f"palpate/{SESSION}/command/{self.name}",
+            self.key(f"command/{self.name}"),
             payload,
             priority=zenoh.Priority.REAL_TIME,
             express=True,
@@ -134,79 +294,53 @@ class RawClient:
             stop.set()
             thread.join()
 
+    def force_when(self, condition: Callable[[dict[str, Any]], object], what: str) -> dict[str, Any]:
+        """The first force that meets a condition, of those whose tick begins from now on."""
+        return _first_from_now(self.forces, condition, what)
+
+    def status_when(self, condition: Callable[[dict[str, Any]], object], what: str) -> dict[str, Any]:
+        """The first status that meets a condition, of those that the server makes from now on."""
+        return _first_from_now(self.statuses, condition, what)
+
     def next_status(self) -> dict[str, Any]:
-        """The second status from now: the first may have been made before."""
-        count = len(self.statuses)
-        wait_for(lambda: len(self.statuses) >= count + 2, "a status")
-        return self.statuses[-1]
+        return self.status_when(lambda status: True, "a status")
 
 
-def wait_for(condition: Callable[[], object], what: str, seconds: float = 20.0) -> None:
-    give_up = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < give_up, f"waited {seconds} s for {what}"
-        time.sleep(0.005)
+def _first_from_now(
+    messages: list[dict[str, Any]], condition: Callable[[dict[str, Any]], object], what: str
+) -> dict[str, Any]:
+    """What has come, or is on its way, may be old news: one machine has one monotonic clock, which tells."""
+    now_ns, looked_at = time.monotonic_ns(), len(messages)
+
+    def look() -> tuple[dict[str, Any] | None, dict[str, Any]]:
+        nonlocal looked_at
+        while looked_at < len(messages):
+            message = messages[looked_at]
+            looked_at += 1
+            if message["server_time_ns"] >= now_ns and condition(message):
+                return message, message
+        return None, messages[-1]
+
+    found: dict[str, Any] = wait_for(look, what, lambda seen: seen[0] is not None)[0]
+    return found
 
 
-@pytest.fixture
-def serve(
-    tmp_path: Path, make_spring_mass_model: Callable[..., ReducedModel]
-) -> Iterator[Callable[..., ServedModel]]:
-    processes: list[subprocess.Popen[str]] = []
-
-    def start(*options: str, n_contacts: int = 1, listen: bool = True) -> ServedModel:
-        model = make_spring_mass_model(n_contacts, 20)
-        path = tmp_path / f"model{n_contacts}.npz"
-        save_model(model, path)
-        endpoint = free_endpoint()
-        place = ("--listen", endpoint) if listen else ()
-        process = subprocess.Popen(
-            [sys.executable, "-m", "palpate_server", str(path), *place, "--session", SESSION, *options],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        processes.append(process)
-        assert process.stdout is not None
-        give_up = time.monotonic() + START_S
-        before: list[str] = []
-        for line in process.stdout:
-            if line.startswith("serving"):
-                return ServedModel(process, endpoint, model, before)
-            before.append(line)
-            assert time.monotonic() < give_up
-        raise AssertionError("the server did not start")
-
-    yield start
-    for process in processes:
-        process.kill()
-        process.wait()
-        if process.stdout:
-            process.stdout.close()
+def _configuration(place: str | Path) -> zenoh.Config:
+    if isinstance(place, Path):
+        return zenoh.Config.from_file(place)
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "peer",
+        "listen/endpoints": [],
+        "connect/endpoints": [place],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
 
 
-@pytest.fixture
-def run_example() -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    processes: list[subprocess.Popen[str]] = []
-
-    def run(script: str, endpoint: str, *options: str) -> subprocess.Popen[str]:
-        patient = ("--silence-s", "5")  # a busy test machine is no reason to let go
-        place = ("--connect", endpoint, "--session", SESSION)
-        process = subprocess.Popen(
-            [sys.executable, str(EXAMPLES / script), *place, *patient, *options],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        processes.append(process)
-        return process
-
-    yield run
-    for process in processes:
-        process.kill()
-        process.communicate()
-
-
-@pytest.fixture
+@pytest.fixture(scope="session")
 def connect() -> type[RawClient]:
+    """connect(endpoint or configuration file, name=..., server="test") -> RawClient, for a `with` statement"""
     return RawClient

@@ -2,104 +2,113 @@
 
 from __future__ import annotations
 
+import csv
 import json
-import socket
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from palpate.demo import read_touch
 from palpate.diagonal_system import full_system
 from palpate.model import ReducedModel, load_model
 from palpate.plots import Touch
 from palpate.reduction.evidence import step_through
+from palpate_server.replay import read_session
+from palpate_server.round_trips import free_endpoint
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Poke:
+    """What the client said and heard of a poke, and what was recorded of every tick."""
+
+    model: ReducedModel
+    summary: dict[str, Any]
+    heard: list[dict[str, str]]
+    ticks: list[dict[str, Any]]
+
+    def channels(self, quantity: str) -> Array:
+        """(ticks, 3 n_contacts)"""
+        return np.array([tick[quantity] for tick in self.ticks]).reshape(len(self.ticks), -1)
 
 
 @pytest.fixture(scope="module")
-def recorded(
-    tmp_path_factory: pytest.TempPathFactory, slab_scene: Callable[..., str]
-) -> Iterator[tuple[ReducedModel, Touch, dict[str, object]]]:
+def poke(
+    start_for_module: Callable[..., Any],
+    connect: Callable[..., Any],
+    tmp_path_factory: pytest.TempPathFactory,
+    slab_scene: Callable[..., str],
+) -> Poke:
     """A slab built, served in one process and poked at its second contact by the headless client in another."""
     folder = tmp_path_factory.mktemp("chain")
+    palpate = partial(start_for_module, "-m", "palpate.cli", cwd=folder)
     (folder / "slab.toml").write_text(
         slab_scene(("left", 0.02, 0.006), ("right", 0.05, 0.006), more="[reduction]\ntolerance = 0.02\n")
     )
-    build = [sys.executable, "-m", "palpate.cli", "build", "slab.toml"]
-    subprocess.run(build, cwd=folder, check=True, capture_output=True, timeout=120)
-    model = load_model(folder / "slab.npz")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    serve = [
-        sys.executable,
-        "-m",
-        "palpate.cli",
-        "serve",
-        "slab.npz",
-        "--listen",
-        endpoint,
-        "--session",
-        "chain",
-    ]
-    with subprocess.Popen(serve, cwd=folder, stdout=subprocess.PIPE, text=True) as server:
-        try:
-            assert server.stdout is not None
-            assert "serving slab" in server.stdout.readline()
-            client = [
-                sys.executable,
-                "-m",
-                "palpate.cli",
-                "client",
-                "--connect",
-                endpoint,
-                "--session",
-                "chain",
-            ]
-            client += ["--contact", "right", "--amplitude-m", "0.002", "--frequency-hz", "2"]
-            client += ["--duration-s", "3", "--record", "poke.csv", "--json"]
-            done = subprocess.run(client, cwd=folder, capture_output=True, text=True, timeout=60, check=False)
-            assert done.returncode == 0, done.stderr
-        finally:
-            server.terminate()
-            assert server.wait(10) == 0
-    yield model, read_touch(folder / "poke.csv", model), json.loads(done.stdout)
+    code, _, err = palpate("build", "slab.toml").finish()
+    assert code == 0, err
+    endpoint = free_endpoint()
+    place = ("--session", "chain", "--listen", endpoint)
+    server = palpate("serve", "slab.npz", *place, "--recordings", ".", ready="serving slab")
+    with connect(endpoint, server="chain") as client:
+        assert client.control("record", {"file": "poke.mcap"})[0]
+        place = ("--session", "chain", "--connect", endpoint, "--silence-s", "30")
+        motion = ("--contact", "right", "--amplitude-m", "0.002", "--frequency-hz", "2", "--duration-s", "2")
+        code, out, err = palpate("client", *place, *motion, "--record", "poke.csv", "--json").finish()
+        assert code == 0, err
+        assert client.control("record", {"file": None})[1]["error"] is None
+    assert server.stop() == 0
+    with (folder / "poke.csv").open(newline="") as file:
+        heard = list(csv.DictReader(file))
+    ticks = read_session(folder / "poke.mcap").forces
+    return Poke(load_model(folder / "slab.npz"), json.loads(out), heard, ticks)
 
 
 def test_the_client_installed_with_palpate_is_the_example_a_user_copies() -> None:
     assert (Path(str(files("palpate_client_examples"))) / "headless_client.py").is_file()
 
 
-def test_commands_are_answered_and_the_contract_holds(
-    recorded: tuple[ReducedModel, Touch, dict[str, object]],
-) -> None:
-    _, _, summary = recorded
-    assert summary["contact"] == "right"
-    assert summary["contract_broken"] == []
-    assert summary["server_lost"] is None
+def test_commands_are_answered_and_the_contract_holds(poke: Poke) -> None:
+    assert poke.summary["contact"] == "right"
+    assert poke.summary["commands_answered"] > 0
+    assert poke.summary["contract_broken"] == []
+    assert poke.summary["server_lost"] is None
 
 
-def test_the_poke_moved_the_chosen_contact_and_the_one_that_nobody_holds_gives_no_force(
-    recorded: tuple[ReducedModel, Touch, dict[str, object]],
-) -> None:
-    model, touch, _ = recorded
-    inward = -np.asarray(model.contacts[1].normal)
-    assert np.max(touch.displacement_m[:, 3:] @ inward) == pytest.approx(0.002, rel=0.02)
-    assert np.all(touch.displacement_m[:, :3] == 0)
-    assert np.max(touch.force_full_n[:, 3:] @ inward) > 0
-    assert np.all(touch.force_n[:, :3] == 0)
+def test_the_poke_moved_the_chosen_contact_and_the_one_that_nobody_holds_gives_no_force(poke: Poke) -> None:
+    inward = -np.asarray(poke.model.contacts[1].normal)
+    displacement, force = poke.channels("displacement_m"), poke.channels("force_n")
+    assert np.max(displacement[:, 3:] @ inward) == pytest.approx(0.002, rel=0.02)
+    assert np.all(displacement[:, :3] == 0)
+    assert np.max(force[:, 3:] @ inward) > 0
+    assert np.all(force[:, :3] == 0)
 
 
-def test_the_served_force_is_the_full_models_within_the_error_that_the_file_states(
-    recorded: tuple[ReducedModel, Touch, dict[str, object]],
-) -> None:
+def test_the_client_heard_the_forces_that_the_server_computed(poke: Poke) -> None:
+    """Force messages are best effort: on a busy machine some ticks may be unheard."""
+    recorded = {tick["tick"]: tick for tick in poke.ticks}
+    common = [row for row in poke.heard if int(row["tick"]) in recorded]
+    assert len(common) > 100
+    for row in common:
+        force = [[float(row[f"{name}.force_{axis}_n"]) for axis in "xyz"] for name in ("left", "right")]
+        assert force == recorded[int(row["tick"])]["force_n"]
+
+
+def test_the_served_force_is_the_full_models_within_the_error_that_the_file_states(poke: Poke) -> None:
     """By Parseval, the force error in the band has at most error_in_band times the energy of |F| |u| there."""
-    model, touch, _ = recorded
+    model = poke.model
     full = full_system(model.full)
+    displacement, force = poke.channels("displacement_m"), poke.channels("force_n")
+    time = np.arange(len(force)) * model.period_s
+    scale = np.repeat(poke.channels("force_scale"), 3, axis=1)
+    touch = Touch(time, displacement, force, scale * full.response(displacement, model.period_s))
     steady = np.all(touch.force_n[:, 3:] != 0, axis=1)  # a contact that nobody holds gives no force
     difference = touch.in_band((touch.force_n - touch.force_full_n)[:, 3:] * steady[:, None], model)
     frequencies = np.fft.rfftfreq(len(touch.time_s), model.period_s)
@@ -113,13 +122,13 @@ def test_the_served_force_is_the_full_models_within_the_error_that_the_file_stat
 
 
 def test_the_stated_time_domain_error_is_found_again_from_the_file_alone(
-    recorded: tuple[ReducedModel, Touch, dict[str, object]],
+    poke: Poke,
 ) -> None:
-    model, _, _ = recorded
+    model = poke.model
     full = full_system(model.full)
     time = np.arange(5000) * model.period_s
-    poke = 1e-3 * np.outer(np.sin(np.pi * time / 5) ** 4, np.ones(model.n_inputs))
-    exact = full.response(poke, model.period_s)
-    served = step_through(model.discrete, poke)
+    press = 1e-3 * np.outer(np.sin(np.pi * time / 5) ** 4, np.ones(model.n_inputs))
+    exact = full.response(press, model.period_s)
+    served = step_through(model.discrete, press)
     error = np.max(np.linalg.norm(served - exact, axis=1)) / np.max(np.linalg.norm(exact, axis=1))
     assert error <= max(model.evidence.error_in_band, model.evidence.error_time_domain)

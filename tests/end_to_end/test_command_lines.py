@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,14 +13,11 @@ from palpate_server import check_host, record
 from palpate_server.__main__ import main as serve_main
 
 
-def run(*command: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=60)
-
-
-def assert_is_refused(result: subprocess.CompletedProcess[str], words: str) -> None:
-    assert result.returncode == 2, result.stderr
-    assert len(result.stderr.splitlines()) == 1
-    assert words in result.stderr
+def assert_is_refused(program: Any, words: str) -> None:
+    code, _, err = program.finish()
+    assert code == 2, err
+    assert len(err.splitlines()) == 1
+    assert words in err
 
 
 @pytest.mark.parametrize(
@@ -33,24 +28,28 @@ def assert_is_refused(result: subprocess.CompletedProcess[str], words: str) -> N
         ("metrics", "prometheus_client", "metrics"),
     ],
 )
-def test_a_tool_without_its_extra_says_which_one_to_install(module: str, package: str, extra: str) -> None:
+def test_a_tool_without_its_extra_says_which_one_to_install(
+    start: Callable[..., Any], module: str, package: str, extra: str
+) -> None:
     without = f"import runpy, sys; sys.modules[{package!r}] = None; runpy.run_module('palpate_server.{module}', run_name='__main__')"
-    assert_is_refused(run("-c", without), f"needs the package {package}: install palpate[{extra}]")
+    assert_is_refused(start("-c", without), f"needs the package {package}: install palpate[{extra}]")
 
 
-def test_a_recording_that_exists_is_not_written_over(serve: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_recording_that_exists_is_not_written_over(
+    serve: Callable[..., Any], start: Callable[..., Any], tmp_path: Path
+) -> None:
     out = tmp_path / "earlier.mcap"
     out.write_bytes(b"an hour of work")
     served = serve()
-    options = ("-m", "palpate_server.record", str(out), "--session", "test", "--duration-s", "0.1")
-    assert_is_refused(run(*options, "--connect", served.endpoint), "earlier.mcap exists")
+    options = ("--session", "test", "--duration-s", "0.1", "--connect", served.endpoint)
+    assert_is_refused(start("-m", "palpate_server.record", out, *options), "earlier.mcap exists")
     assert out.read_bytes() == b"an hour of work"
 
 
-def test_without_a_server_no_file_is_left_behind(tmp_path: Path) -> None:
+def test_without_a_server_no_file_is_left_behind(start: Callable[..., Any], tmp_path: Path) -> None:
     out = tmp_path / "new.mcap"
-    result = run("-m", "palpate_server.record", str(out), "--connect", "tcp/127.0.0.1:1")
-    assert_is_refused(result, "tcp/127.0.0.1:1")
+    recorder = start("-m", "palpate_server.record", out, "--connect", "tcp/127.0.0.1:1")
+    assert_is_refused(recorder, "tcp/127.0.0.1:1")
     assert not out.exists()
 
 
@@ -81,14 +80,18 @@ def test_a_check_of_the_host_takes_an_hour_at_most(capsys: pytest.CaptureFixture
     assert "'1e300' is more than 3600" in refusal(check_host.main, "--seconds=1e300", capsys=capsys)
 
 
-@pytest.mark.parametrize("option", ["--models", "--black-box", "--recordings"])
-@pytest.mark.parametrize("folder", ["/proc/nothing", "file"])
 def test_a_folder_that_cannot_be_used_is_found_at_the_start(
-    option: str, folder: str, tmp_path: Path, make_spring_mass_model: Callable[..., ReducedModel]
+    start: Callable[..., Any], tmp_path: Path, make_spring_mass_model: Callable[..., ReducedModel]
 ) -> None:
     model, file = tmp_path / "model.npz", tmp_path / "file"
     save_model(make_spring_mass_model(1, 2), model)
     file.touch()
-    where = str(file) if folder == "file" else folder
-    result = run("-m", "palpate_server", str(model), "--listen", "tcp/127.0.0.1:0", option, where)
-    assert_is_refused(result, f"{option} {where}")
+    wrong = [
+        (option, folder)
+        for option in ("--models", "--black-box", "--recordings")
+        for folder in (Path("/proc/nothing"), file)
+    ]
+    place = ("--listen", "tcp/127.0.0.1:0")
+    programs = [start("-m", "palpate_server", model, *place, *option) for option in wrong]
+    for (option, folder), program in zip(wrong, programs, strict=True):
+        assert_is_refused(program, f"{option} {folder}")

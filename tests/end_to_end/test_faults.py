@@ -6,14 +6,14 @@ import itertools
 import json
 import math
 import random
-import subprocess
-import sys
+import signal
 import time
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
-import zenoh
 
 from palpate_server import wire
 from palpate_server.round_trips import free_endpoint
@@ -54,26 +54,32 @@ def served(serve: Callable[..., Any]) -> Any:
 def test_bursts_of_commands_make_no_more_ticks_than_time_has(
     served: Any, connect: Callable[..., Any]
 ) -> None:
+    def in_time(message: dict[str, Any]) -> bool:
+        return not message["flags"][0] & (Flags.LATE | Flags.CAUGHT_UP)
+
     with connect(served.endpoint) as client:
         assert client.acquire("tip")[0]
-        before, started = client.next_status(), time.monotonic_ns()
-        bursts = 80
+        before = client.next_status()
+        first = client.force_when(in_time, "a tick in time")
+        bursts = 100
         for burst in range(bursts):
             for _ in range(100):
                 client.command({"tip": [0.0, 0.0, DEPTH_M * burst / bursts]})
-            time.sleep(0.015)  # within what is held, so that the force is there
+            time.sleep(0.01)  # within what is held, so that the force is there
+        sent = 100 * bursts
+        client.status_when(lambda status: status["accepted"] - before["accepted"] == sent, "all commands")
+        last = client.force_when(in_time, "a tick in time")
         after = client.next_status()
-        ticks = after["ticks"] + after["skipped_ticks"] - before["ticks"] - before["skipped_ticks"]
-        elapsed_ns = after["server_time_ns"] - before["server_time_ns"]
-        assert time.monotonic_ns() - started > 1e9
-        assert ticks <= elapsed_ns * 1.002e-6 + 2  # the deadlines follow a client by 0.2 % at most
-        assert ticks >= elapsed_ns * 0.998e-6 - 25  # what is missed now is made up for later
-        assert after["accepted"] - before["accepted"] == 100 * bursts
         # Every command was used by one tick, or replaced before; of those that were used, the answer may be lost.
         superseded = after["dropped"]["superseded"] - before["dropped"]["superseded"]
         answered = {message["sequence"][0] for message in client.forces} - {-1}
-        assert superseded > 50 * bursts
-        assert len(answered) <= 100 * bursts - superseded
+        assert len(answered) <= sent - superseded <= after["ticks"] - before["ticks"]
+        assert after["accepted"] - before["accepted"] == sent
+        ticks, elapsed_ns = (last[field] - first[field] for field in ("tick", "server_time_ns"))
+        skipped = after["skipped_ticks"] - before["skipped_ticks"]
+        assert elapsed_ns > 1e9
+        assert ticks <= elapsed_ns * 1.002e-6 + 2  # the deadlines follow a client by 0.2 % at most
+        assert ticks >= elapsed_ns * 0.998e-6 - 2 - skipped
         check(client.forces)
         assert limits_were_met(client.forces)
 
@@ -92,8 +98,7 @@ def test_a_clients_clock_that_jumps_changes_nothing_but_the_echo(
             }
             client.put(wire.pack(message))
             time.sleep(0.001)
-        status = client.next_status()
-        assert status["accepted"] == 399
+        client.status_when(lambda status: status["accepted"] == 399, "all commands")
         answered = [m for m in client.forces if m["sequence"][0] > 0]
         assert all(m["client_time_ns"][0] == jumps[m["sequence"][0] % len(jumps)] for m in answered)
         check(client.forces)
@@ -110,7 +115,9 @@ def test_reordered_and_repeated_commands_never_move_the_tip_back(
         for sequence in order:
             client.command({"tip": [0.0, 0.0, DEPTH_M * sequence / 500]}, sequence=sequence)
             time.sleep(0.0005)
-        status = client.next_status()
+        status = client.status_when(
+            lambda status: status["accepted"] + sum(status["refused"].values()) == len(order), "all commands"
+        )
         newest = list(itertools.accumulate(order, max))
         accepted = 1 + sum(b > a for a, b in itertools.pairwise(newest))
         assert status["accepted"] == accepted
@@ -130,10 +137,11 @@ def test_of_two_clients_fighting_for_a_contact_one_moves_it(served: Any, connect
                 granted, refusal = second.acquire("tip")
                 assert (granted, refusal["reason"]) == (False, "held")
             time.sleep(0.001)
-        status = first.next_status()
-        # Commands are best effort, so a busy machine may lose some; none of the second client's may count as accepted.
-        assert 0 < status["accepted"] <= 200
-        assert 0 < status["refused"]["not_holder"] <= 200
+        status = first.status_when(
+            lambda status: status["accepted"] + sum(status["refused"].values()) == 400, "all commands"
+        )
+        assert status["accepted"] == 200
+        assert status["refused"]["not_holder"] == 200
         moved = [m["displacement_m"][0][2] for m in first.forces]
         assert min(moved) >= 0
         check(first.forces)
@@ -150,61 +158,33 @@ with zenoh.open(config):
 """
 
 
-def start_router(endpoint: str) -> subprocess.Popen[str]:
-    settings = {"mode": "router", "listen/endpoints": [endpoint], "scouting/multicast/enabled": False}
-    process = subprocess.Popen(
-        [sys.executable, "-c", ROUTER, json.dumps(settings)], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    return process
-
-
 def test_a_router_that_is_restarted_fades_the_force_and_lets_the_client_come_back(
-    serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Any
+    serve: Callable[..., Any], connect: Callable[..., Any], start: Callable[..., Any], tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()
-    router = start_router(endpoint)
-    try:
-        config = tmp_path / "behind_router.json5"
-        config.write_text(
-            json.dumps(
-                {
-                    "mode": "client",
-                    "connect": {
-                        "endpoints": [endpoint],
-                        "retry": {"period_init_ms": 200, "period_max_ms": 500},
-                    },
-                    "scouting": {"multicast": {"enabled": False}},
-                }
-            )
-        )
-        served = serve(*LIMITS, "--zenoh-config", str(config), listen=False)
-        with connect(endpoint) as client:
-            assert client.acquire("tip")[0]
-            for _ in range(400):
-                client.command({"tip": [0.0, 0.0, 1e-3]})
-                time.sleep(0.001)
-            assert client.forces[-1]["force_scale"][0] > 0
-            ticks = client.statuses[-1]["ticks"]
-        router.kill()
-        router.communicate()
-        time.sleep(0.5)
-        assert served.process.poll() is None
-        router = start_router(endpoint)
-        give_up = time.monotonic() + 30
-        while True:  # the server has to find its router again
-            try:
-                with connect(endpoint) as client:
-                    assert client.forces[0]["force_scale"] == [0.0]
-                    assert client.statuses[-1]["ticks"] > ticks
-                    assert client.acquire("tip")[0]
-                    client.command({"tip": [0.0, 0.0, 1e-3]})
-                    check(client.forces)
-                    break
-            except (zenoh.ZError, AssertionError):
-                if time.monotonic() > give_up:
-                    raise
-    finally:
-        router.kill()
-        router.communicate()
+    settings = {"mode": "router", "listen/endpoints": [endpoint], "scouting/multicast/enabled": False}
+    start_router = partial(start, "-c", ROUTER, json.dumps(settings), ready="ready")
+    behind = {
+        "mode": "client",
+        "connect": {"endpoints": [endpoint], "retry": {"period_init_ms": 200, "period_max_ms": 500}},
+        "scouting": {"multicast": {"enabled": False}},
+    }
+    config = tmp_path / "behind_router.json5"
+    config.write_text(json.dumps(behind))
+    router = start_router()
+    served = serve(*LIMITS, "--zenoh-config", str(config), listen=False)
+    with connect(endpoint) as client:
+        assert client.acquire("tip")[0]
+        with client.pressing({"tip": [0.0, 0.0, 1e-3]}):
+            last = client.force_when(lambda force: force["force_scale"][0] == 1, "the force")
+    router.stop(signal.SIGKILL)
+    start_router()
+    with connect(endpoint) as client:  # as soon as the server has found its router again
+        faded = client.force_when(lambda force: force["flags"][0] & Flags.STALE, "a force without a client")
+        assert faded["force_n"] == [[0.0, 0.0, 0.0]]
+        assert faded["tick"] > last["tick"]
+        assert client.acquire("tip")[0]
+        with client.pressing({"tip": [0.0, 0.0, 1e-3]}):
+            client.force_when(lambda force: force["force_scale"][0] > 0, "the force")
+        check(client.forces)
+    assert served.process.poll() is None

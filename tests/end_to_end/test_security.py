@@ -8,14 +8,11 @@ import shutil
 import socket
 import ssl
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import pytest
 import zenoh
 from mcap.reader import make_reader
@@ -103,92 +100,47 @@ def with_a_second_operator(text: str) -> str:
     return text
 
 
-@contextmanager
-def serving(folder: Path) -> Iterator[None]:
-    arguments = (str(folder / "model.npz"), "--zenoh-config", str(folder / "server.json5"))
-    process = subprocess.Popen(
-        [sys.executable, "-m", "palpate_server", *arguments], stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("serving")
-        yield
-    finally:
-        process.kill()
-        process.communicate()
+@pytest.fixture(scope="module")
+def serve_folder(start_for_module: Callable[..., Any]) -> Callable[[Path], None]:
+    def serve_folder(folder: Path) -> None:
+        options = (folder / "model.npz", "--zenoh-config", folder / "server.json5")
+        start_for_module("-m", "palpate_server", *options, ready="serving")
+
+    return serve_folder
 
 
 @pytest.fixture(scope="module")
-def server(folder: Path) -> Iterator[None]:
-    with serving(folder):
-        yield
+def server(serve_folder: Callable[[Path], None], folder: Path) -> None:
+    serve_folder(folder)
 
 
-class Client:
-    """A session with somebody's certificate, under any name, that keeps the forces and statuses it hears."""
+@pytest.fixture
+def connect_as(connect: Callable[..., Any], folder: Path) -> Callable[..., Any]:
+    """A client with somebody's certificate, under any name."""
 
-    def __init__(self, folder: Path, certificate: str, name: str) -> None:
-        self.name = name
-        self.forces: list[dict[str, Any]] = []
-        self.statuses: list[dict[str, Any]] = []
-        self.sequence = 0
-        self.session = zenoh.open(zenoh.Config.from_file(folder / f"{certificate}.json5"))
-        for key, to in ((KEYS.force, self.forces), (KEYS.status, self.statuses)):
-            self.session.declare_subscriber(key, _appender(to))
-        self.token = self.session.liveliness().declare_token(KEYS.client(name))
+    def connect_as(certificate: str, name: str = "", folder: Path = folder) -> Any:
+        return connect(folder / f"{certificate}.json5", name=name or certificate, server="main")
 
-    def __enter__(self) -> Client:
-        try:
-            wait_for(lambda: self.forces and self.statuses)
-        except BaseException:
-            self.session.close()  # or the program would hang at its end
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.session.close()
-
-    def control(self, action: str, request: dict[str, Any]) -> str:
-        """ "ok", the reason of the server's refusal, or "" when the server did not answer: it was not asked."""
-        for reply in self.session.get(
-            KEYS.control(self.name, action), payload=wire.pack(request), timeout=1.0
-        ):
-            if reply.ok is not None:
-                return "ok"
-            if reply.err is not None and str(reply.err.encoding).startswith("application/msgpack"):
-                return str(msgpack.unpackb(reply.err.payload.to_bytes())["reason"])
-        return ""
-
-    def acquire(self) -> str:
-        return self.control("acquire", {"contacts": ["tip"]})
-
-    def command(self, depth_m: float) -> None:
-        self.sequence += 1
-        displacement = {"tip": [0.0, 0.0, -depth_m]}
-        command = {"sequence": self.sequence, "client_time_ns": 1, "displacement_m": displacement}
-        self.session.put(KEYS.command(self.name), wire.pack(command))
-
-    def next_status(self) -> dict[str, Any]:
-        """One that was made after everything that the server has heard until now."""
-        count = len(self.statuses)
-        wait_for(lambda: len(self.statuses) >= count + 3)
-        return self.statuses[-1]
+    return connect_as
 
 
-def wait_for(condition: Callable[[], object]) -> None:
-    give_up = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < give_up
-        time.sleep(0.01)
+@pytest.fixture
+def run_client(start: Callable[..., Any]) -> Callable[[Path, str], Any]:
+    def run_client(folder: Path, who: str) -> Any:
+        options = ("--zenoh-config", folder / f"{who}.json5", "--name", who, "--silence-s", "30")
+        return start(CLIENT, *options, "--duration-s", "1", "--json")
+
+    return run_client
 
 
-def _appender(to: list[dict[str, Any]]) -> Callable[[zenoh.Sample], None]:
-    return lambda sample: to.append(msgpack.unpackb(sample.payload.to_bytes()))
-
-
-def assert_powerless(client: Client) -> None:
+def assert_powerless(client: Any) -> None:
     """The server is not asked, its counters stay as they are, and the tool stays where it is."""
-    before = client.next_status()
+    before = client.status_when(
+        lambda status: (
+            status["contacts"]["tip"]["holder"] is None and status["contacts"]["tip"]["success_rate"] == 0
+        ),
+        "nobody at the tool",
+    )
     first = len(client.forces)
     for action, request in (
         ("acquire", {"contacts": ["tip"]}),
@@ -198,9 +150,11 @@ def assert_powerless(client: Client) -> None:
         ("load", {"model": "model.npz"}),
         ("record", {}),
     ):
-        assert client.control(action, request) == ""
+        with pytest.raises(TimeoutError):
+            client.control(action, request)
     for _ in range(100):
-        client.command(0.001)
+        client.command({"tip": [0.0, 0.0, -0.001]})
+    time.sleep(0.2)  # for what must not happen
     after = client.next_status()
     for counter in ("accepted", "refused", "malformed"):
         assert after[counter] == before[counter]
@@ -208,33 +162,26 @@ def assert_powerless(client: Client) -> None:
     assert not any(any(message["displacement_m"][0]) for message in client.forces[first:])
 
 
-def run_client(folder: Path, who: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(CLIENT), "--zenoh-config", str(folder / f"{who}.json5"), "--name", who]
-    return subprocess.run(
-        [*command, "--duration-s", "1", "--json"], capture_output=True, text=True, timeout=60
-    )
-
-
 @pytest.mark.usefixtures("server")
-def test_an_operator_moves_the_tool_and_feels_it(folder: Path) -> None:
-    done = run_client(folder, "operator")
-    assert done.returncode == 0, done.stderr
-    summary = json.loads(done.stdout)
+def test_an_operator_moves_the_tool_and_feels_it(folder: Path, run_client: Callable[..., Any]) -> None:
+    code, out, err = run_client(folder, "operator").finish()
+    assert code == 0, err
+    summary = json.loads(out)
     assert summary["commands_answered"] > 0
     assert summary["largest_force_n"] > 0
 
 
 @pytest.mark.usefixtures("server")
-@pytest.mark.parametrize("who", ["nobody", "plain", "foreign", "expired", "self_signed", "servers_own"])
 def test_without_a_certificate_of_our_authority_nothing_is_read_and_nothing_moved(
-    folder: Path, who: str
+    folder: Path, run_client: Callable[..., Any]
 ) -> None:
-    done = run_client(folder, who)
-    assert done.returncode == 2
-    assert "palpate client:" in done.stderr
-
-    with pytest.raises(zenoh.ZError):  # there is not even a session in which to listen
-        zenoh.open(zenoh.Config.from_file(folder / f"{who}.json5")).close()
+    everybody = ("nobody", "plain", "foreign", "expired", "self_signed", "servers_own")
+    for client in [run_client(folder, who) for who in everybody]:
+        code, out, err = client.finish()
+        assert code == 2
+        assert not out
+        # There is not even a session in which to listen.
+        assert err.startswith("palpate client: nothing answers at"), client.process.args
 
 
 @pytest.mark.usefixtures("server")
@@ -249,24 +196,26 @@ def test_without_a_certificate_of_our_authority_nothing_is_read_and_nothing_move
     ],
 )
 def test_who_is_no_operator_of_that_name_hears_forces_but_cannot_move_the_tool(
-    folder: Path, certificate: str, name: str
+    connect_as: Callable[..., Any], certificate: str, name: str
 ) -> None:
-    with Client(folder, certificate, name) as client:
+    with connect_as(certificate, name) as client:
         assert_powerless(client)
 
 
 @pytest.mark.usefixtures("server")
-def test_a_certificate_of_ours_with_an_unknown_name_hears_nothing(folder: Path) -> None:
-    with Client(folder, "operator", "operator") as operator:
-        stranger = Client(folder, "second", "second")
+def test_a_certificate_of_ours_with_an_unknown_name_hears_nothing(connect_as: Callable[..., Any]) -> None:
+    with connect_as("operator") as operator:
+        stranger = connect_as("second")
+        stranger.open()
         try:
-            operator.next_status()
-            operator.next_status()
+            for _ in range(3):
+                operator.next_status()
             assert not stranger.forces
             assert not stranger.statuses
-            assert stranger.acquire() == ""
+            with pytest.raises(TimeoutError):
+                stranger.acquire("tip")
         finally:
-            stranger.session.close()
+            stranger.close()
 
 
 def handshake(folder: Path, certificates: Path) -> None:
@@ -282,59 +231,52 @@ def handshake(folder: Path, certificates: Path) -> None:
 
 
 @pytest.mark.usefixtures("server")
-def test_a_clients_certificate_is_not_taken_for_the_servers(folder: Path, certificates: Path) -> None:
+def test_a_clients_certificate_is_not_taken_for_the_servers(
+    folder: Path,
+    certificates: Path,
+    serve_folder: Callable[[Path], None],
+    run_client: Callable[..., Any],
+) -> None:
     handshake(folder, certificates)  # the real one
 
     posing = certificates.with_name("posing")
     server = (EXAMPLE / "server.json5").read_text()
     write_configurations(posing, certificates, server.replace("/server.", "/observer."))
-    with serving(posing):
-        with pytest.raises(ssl.SSLCertVerificationError):
-            handshake(posing, certificates)
-        done = run_client(posing, "operator")
-    assert done.returncode == 2
-    assert not done.stdout  # it heard nothing, and rendered nothing
-    assert "nothing answers" in done.stderr
+    serve_folder(posing)
+    with pytest.raises(ssl.SSLCertVerificationError):
+        handshake(posing, certificates)
+    code, out, err = run_client(posing, "operator").finish()
+    assert code == 2
+    assert not out  # it heard nothing, and rendered nothing
+    assert "nothing answers" in err
 
 
 @pytest.mark.usefixtures("server")
-def test_a_recorder_records_the_commands_of_an_operator(folder: Path, tmp_path: Path) -> None:
+def test_a_recorder_records_the_commands_of_an_operator(
+    folder: Path, tmp_path: Path, start: Callable[..., Any], run_client: Callable[..., Any]
+) -> None:
     out = tmp_path / "session.mcap"
-    options = (str(out), "--zenoh-config", str(folder / "recorder.json5"))
-    recorder = subprocess.Popen(
-        [sys.executable, "-m", "palpate_server.record", *options], stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert recorder.stdout is not None
-        assert recorder.stdout.readline().startswith("recording")
-        time.sleep(0.5)  # until the server knows that it listens
-        done = run_client(folder, "operator")
-        assert done.returncode == 0, done.stderr
-        recorder.terminate()
-        assert recorder.wait(20) == 0
-    finally:
-        recorder.kill()
-        recorder.communicate()
+    options = (out, "--zenoh-config", folder / "recorder.json5")
+    recorder = start("-m", "palpate_server.record", *options, ready="recording")
+    code, _, err = run_client(folder, "operator").finish()
+    assert code == 0, err
+    assert recorder.stop() == 0
     with out.open("rb") as stream:
-        topics = [channel.topic for _, channel, _ in make_reader(stream).iter_messages()]
-    answered = json.loads(done.stdout)["commands_answered"]
-    assert answered > 0
-    assert topics.count(KEYS.command("operator")) >= answered // 2  # best effort, on a busy machine
+        topics = {channel.topic for _, channel, _ in make_reader(stream).iter_messages()}
+    assert KEYS.command("operator") in topics
 
 
 @pytest.mark.usefixtures("server")
-def test_nobody_hears_an_observer(folder: Path) -> None:
-    with (
-        Client(folder, "operator", "operator") as operator,
-        Client(folder, "observer", "observer") as observer,
-    ):
+def test_nobody_hears_an_observer(connect_as: Callable[..., Any]) -> None:
+    with connect_as("operator") as operator, connect_as("observer") as observer:
         gone: list[zenoh.Sample] = []
         changes = operator.session.liveliness().declare_subscriber(KEYS.server, gone.append)
+        before = operator.next_status()
         for key in (KEYS.force, KEYS.status, KEYS.surface, KEYS.command("operator")):
             for _ in range(10):
                 observer.session.put(key, wire.pack({"forged": True}))
         observer.session.liveliness().declare_token(KEYS.server).undeclare()
-        before = operator.next_status()
+        time.sleep(0.2)  # for what must not happen
         after = operator.next_status()
         assert not any("forged" in message for message in operator.forces + operator.statuses)
         assert after["malformed"] == before["malformed"]
@@ -343,30 +285,34 @@ def test_nobody_hears_an_observer(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("server")
-def test_an_observer_cannot_keep_an_operators_lease(folder: Path) -> None:
-    with Client(
-        folder, "observer", "operator"
-    ) as observer:  # its token, too, is on palpate/main/client/operator
-        with Client(folder, "operator", "operator") as operator:
-            assert operator.acquire() == "ok"
-            assert operator.next_status()["contacts"]["tip"]["holder"] == "operator"
-        wait_for(lambda: observer.statuses[-1]["contacts"]["tip"]["holder"] is None)
+def test_an_observer_cannot_keep_an_operators_lease(connect_as: Callable[..., Any]) -> None:
+    def holder(status: dict[str, Any]) -> object:
+        return status["contacts"]["tip"]["holder"]
+
+    with connect_as("observer", "operator") as observer:  # its token, too, is on palpate/main/client/operator
+        with connect_as("operator") as operator:
+            assert operator.acquire("tip")[0]
+            assert holder(operator.next_status()) == "operator"
+        observer.status_when(lambda status: holder(status) is None, "a free contact")
 
 
-def test_two_operators_act_each_under_its_own_name(certificates: Path) -> None:
+def test_two_operators_act_each_under_its_own_name(
+    certificates: Path, serve_folder: Callable[[Path], None], connect_as: Callable[..., Any]
+) -> None:
     folder = certificates.with_name("two")
     server = (EXAMPLE / "server.json5").read_text()
     write_configurations(folder, certificates, with_a_second_operator(server))
+    serve_folder(folder)
     with (
-        serving(folder),
-        Client(folder, "operator", "operator") as first,
-        Client(folder, "second", "second") as second,
+        connect_as("operator", folder=folder) as first,
+        connect_as("second", folder=folder) as second,
     ):
-        with Client(folder, "second", "operator") as pretender:
+        with connect_as("second", "operator", folder=folder) as pretender:
             assert_powerless(pretender)
-        assert first.acquire() == "ok"
-        assert second.acquire() == "held"
-        assert first.control("release", {}) == "ok"
-        assert second.acquire() == "ok"
-        second.command(0.001)
-        wait_for(lambda: any(second.forces[-1]["displacement_m"][0]))
+        assert first.acquire("tip")[0]
+        granted, refusal = second.acquire("tip")
+        assert (granted, refusal["reason"]) == (False, "held")
+        assert first.control("release")[0]
+        assert second.acquire("tip")[0]
+        with second.pressing({"tip": [0.0, 0.0, -0.001]}):
+            second.force_when(lambda force: any(force["displacement_m"][0]), "a movement")
