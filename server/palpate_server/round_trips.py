@@ -61,11 +61,15 @@ class Trace:
     arrival_ns: NDArray[np.int64]
     used: NDArray[np.int64]
 
+    def answered(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The device's ticks at which it had a force, and the commands that these forces answer."""
+        command = np.where(self.rendered >= 0, self.used[self.rendered], -1)
+        return np.flatnonzero(command >= 0), command[command >= 0]
+
     def ages_ns(self) -> NDArray[np.int64]:
-        """How long before the device took up each force it had read the position that this force answers; (<= n,)."""
-        answers = np.where(self.rendered >= 0, self.used[self.rendered], -1)
-        there = answers >= 0
-        return self.device_ns[there] - self.device_ns[answers[there]]
+        """At each of these ticks, how long ago the device had read the position that its force answers."""
+        ticks, commands = self.answered()
+        return self.device_ns[ticks] - self.device_ns[commands]
 
     def piece(self, start: int, ticks: int) -> Trace:
         """The device's ticks from `start` on as a trace of its own; commands before it count as none."""

@@ -98,8 +98,8 @@ def comes_to_rest(position_m: NDArray[np.float64]) -> bool:
     """Whether a handle with these positions (n,), n a multiple of 64, in steps of even time, does not go on vibrating.
 
     How much it shakes is looked at in 64 windows: its largest way off a straight line, for a handle in tissue creeps; of 8
-    windows the median, for a single disturbance is no vibration. In the last eighth of the time that has to be less than
-    SHAKING_M, or less than half as much as in the third eighth.
+    windows the median, for a knock is no vibration. In one of the last five eighths of the time that has to be less than
+    SHAKING_M, or less than half as much as in the third eighth: what vibrates does so all the time.
     """
     if not np.all(np.isfinite(position_m)):
         return False
@@ -108,4 +108,4 @@ def comes_to_rest(position_m: NDArray[np.float64]) -> bool:
     off = windows - windows.mean(axis=1, keepdims=True)
     off -= np.outer(off @ time / (time @ time), time)
     shaking = np.median(np.ptp(off, axis=1).reshape(8, 8), axis=1)
-    return bool(shaking[7] < max(SHAKING_M, 0.5 * shaking[2]))
+    return bool(shaking[3:].min() < max(SHAKING_M, 0.5 * shaking[2]))
