@@ -58,11 +58,14 @@ class Sized(bytes):
 @pytest.fixture
 def server(make_spring_mass_model: Callable[..., ReducedModel], tmp_path: Path) -> Iterator[Server]:
     """Ticks, but is in no session."""
+    server_module.warm_up(1e-3, 2)  # a change that is asked for gives up when no tick comes
     session: Any = None
     limits = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
     server = Server(make_spring_mass_model(2), limits, session, wire.Keys("test"), tmp_path)
     wake = os.eventfd(0)
-    thread = threading.Thread(target=loop.run_at_deadlines, args=(server.service.image, wake))
+    thread = threading.Thread(
+        target=loop.run_at_deadlines, args=(server.service.image, wake), name="deadlines"
+    )
     thread.start()
     yield server
     loop.stop(server.service.memory.shared)
@@ -138,7 +141,8 @@ def test_without_a_tick_a_change_is_refused_and_not_made_later_either(
     server.service.leases.holders["tip"] = "first"
     memory = server.service.memory
     loop.stop(memory.shared)
-    time.sleep(0.05)  # the tick under way is the last one
+    (deadlines,) = (thread for thread in threading.enumerate() if thread.name == "deadlines")
+    deadlines.join()
     for action, request in (("limits", {"limits": {"max_force_n": 1.0}}), ("reset", {})):
         with pytest.raises(Refused, match="no tick") as refusal:
             server.control.carry_out("first", action, request)
@@ -158,7 +162,9 @@ def test_while_the_server_stops_changes_are_refused_at_once(server: Server) -> N
         with pytest.raises(Refused) as refusal:
             server.control.carry_out("first", "limits", {"limits": {"max_force_n": 1.0}})
         assert refusal.value.reason == "stopping"
-    assert time.monotonic() - started < 1.0
+    assert (
+        time.monotonic() - started < 20 * service._CHANGE_TIMEOUT_S
+    )  # which each of them would wait for a tick
 
 
 def test_a_command_that_was_checked_before_its_contact_changed_hands_is_not_carried_out(
@@ -175,6 +181,8 @@ def test_a_command_that_was_checked_before_its_contact_changed_hands_is_not_carr
         server.control.carry_out("second", "acquire", {"contacts": ["tip"]})
         return reason
 
+    applied = server.service.memory.applied
+
     def sample(client: str, sequence: int, depth_m: float) -> Any:
         message = {"sequence": sequence, "client_time_ns": 1, "displacement_m": {"tip": [0.0, 0.0, depth_m]}}
         return SimpleNamespace(payload=Sized(wire.pack(message)), key_expr=f"palpate/test/command/{client}")
@@ -184,13 +192,16 @@ def test_a_command_that_was_checked_before_its_contact_changed_hands_is_not_carr
     monkeypatch.setattr(server, "_why_refused", check_then_lose_the_contact)
     server._on_command(sample("first", 1_000_000, 0.02))
     monkeypatch.setattr(server, "_why_refused", check)
-    time.sleep(0.05)
-    np.testing.assert_array_equal(server.service.memory.applied, 0)
+    time.sleep(0.05)  # for what must not happen
+    np.testing.assert_array_equal(applied, 0)
     assert server.service.messages.accepted == 1
-    server._on_command(sample("second", 1, 1e-3))
-    assert server.service.messages.accepted == 2
-    time.sleep(0.015)
-    np.testing.assert_array_equal(server.service.memory.applied[0], (0.0, 0.0, 1e-3))
+    give_up = time.monotonic() + 60
+    while not np.any(applied):
+        assert time.monotonic() < give_up
+        server._on_command(sample("second", server.service.messages.accepted, 1e-3))
+        time.sleep(0.001)
+    assert server.service.messages.accepted > 1
+    np.testing.assert_array_equal(applied[0], (0.0, 0.0, 1e-3))
 
 
 def test_while_a_model_is_loaded_nobody_acquires_and_the_other_way_round(
