@@ -108,8 +108,8 @@ def collocation_modes(
     """All modes of the collocated rho u'' = T lap(u); complex, since the operator is not symmetric.
 
     With basis order 2 the frequencies converge at second order. The linear basis (order 1), the paper's choice in
-    three dimensions, is inconsistent for a second derivative: some 10 % off at any number of nodes. The force on a tip is minus the divergence of the stress there times the nodal area (the paper's
-    c_tooltip).
+    three dimensions, is inconsistent for a second derivative: some 10 % off at any number of nodes. The force on a tip
+    is minus the divergence of the stress there times the nodal area (the paper's c_tooltip).
     """
     held = supports(membrane.n_nodes, membrane.on_edge, contacts)
     free, tips = held.free, held.tips.toarray()
