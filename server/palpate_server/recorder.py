@@ -29,7 +29,7 @@ log = logging.getLogger("palpate_server")
 
 _PERIOD_S = 0.05
 _MAX_UNWRITTEN = 16 * 2**20  # bytes: a minute of a contact
-_END_S = 2.0  # to write the rest and end the file
+_END_S = 8.0  # to write the rest and end the file: on a busy machine its process is last in the queue
 _PIPE_BYTES = 65536  # that a pipe takes at once
 _TOO_SLOW = "the disk can't keep up"
 
