@@ -30,6 +30,7 @@ log = logging.getLogger("palpate_server")
 _PERIOD_S = 0.05
 _MAX_UNWRITTEN = 16 * 2**20  # bytes: a minute of a contact
 _END_S = 8.0  # to write the rest and end the file: on a busy machine its process is last in the queue
+_LAST_WORDS_S = 1.0  # of a process that has closed its pipe
 _PIPE_BYTES = 65536  # that a pipe takes at once
 _TOO_SLOW = "the disk can't keep up"
 
@@ -197,7 +198,7 @@ class Recorder:
         """Why the process that writes has ended."""
         assert self._process.stderr is not None
         try:
-            code = self._process.wait(_END_S)
+            code = self._process.wait(_LAST_WORDS_S)
         except subprocess.TimeoutExpired:
             return "its process no longer listens"
         lines = self._process.stderr.read().decode(errors="replace").splitlines()
