@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from palpate.model import ReducedModel, StateSpace
+from palpate_server import layout
 from palpate_server.round_trips import Heard, Trace, steady_trace, trace_of
 from palpate_server.simulated_device import Handle, comes_to_rest, press
 
@@ -141,6 +143,42 @@ def test_a_command_that_the_server_never_used_is_never_felt_and_a_lost_force_nev
     assert lost_only[352] - undisturbed[352] == pytest.approx(missing / 0.1 * PERIOD_S**2 / 2, rel=0.01)
 
 
+def test_outside_the_tissue_the_handle_is_free_though_forces_are_still_under_way(
+    spring: Callable[[float], ReducedModel],
+) -> None:
+    reach = np.where(np.arange(1000) < 500, 0.005, -0.005)
+    motion = press(spring(300.0), HANDLE, reach, steady_trace(1000, 3), 0.0)
+    left = 500 + int(np.argmax(motion[500:, 0] <= 0))
+    assert motion[left - 3 : left, 0].min() > 0
+    free = expm(
+        np.array([[0.0, 1.0], [-HANDLE.hand_n_per_m / HANDLE.mass_kg, -DAMPING / HANDLE.mass_kg]]) * PERIOD_S
+    )
+    for before, after in zip(motion[left : left + 3], motion[left + 1 : left + 4], strict=True):
+        expected = free @ (before - [-0.005, 0.0]) + [-0.005, 0.0]
+        np.testing.assert_allclose(after, expected, rtol=1e-12)
+
+
+def test_the_server_is_told_which_force_was_rendered_so_that_it_counts_the_ports_energy_despite_the_delay(
+    spring: Callable[[float], ReducedModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memories: list[layout.Memory] = []
+    make_memory = layout.make_memory
+
+    def keep(*arguments: Any) -> layout.Memory:
+        memories.append(make_memory(*arguments))
+        return memories[-1]
+
+    monkeypatch.setattr(layout, "make_memory", keep)
+    late, begin, end = 3, 500, 900
+    motion = press(spring(300.0), HANDLE, REACH_M[:1000], steady_trace(1000, late), 0.0)
+    records = memories[0].record_motion[:, 0]
+    depth, rendered = motion[:, 0], 300.0 * motion[:, 0]  # the tick that answers a position has its number
+    taken_in = np.sum(rendered[begin - late : end - late] * np.diff(depth[begin : end + 1]))
+    counted = records[end, layout.ENERGY_J] - records[begin, layout.ENERGY_J]
+    assert abs(taken_in) > 1e-8
+    assert counted == pytest.approx(taken_in, rel=1e-9)
+
+
 def test_between_uneven_ticks_the_handle_moves_on_as_long_as_it_really_took() -> None:
     durations = np.array([0.0, 1e-5, 1e-3, 0.07])
     rates = np.array([[0.0, 1.0], [-HANDLE.hand_n_per_m / HANDLE.mass_kg, -DAMPING / HANDLE.mass_kg]])
@@ -164,6 +202,7 @@ def test_creep_and_a_single_disturbance_are_no_vibration_and_a_small_steady_one_
     wave = np.sin(2 * np.pi * 30 * time_s)
     knock = 1e-3 * wave * np.exp(-np.maximum(time_s - 7.3, 0) / 0.05) * (time_s > 7.3)
     assert comes_to_rest(creep + knock)
+    assert comes_to_rest(3e-4 * time_s)
     assert comes_to_rest(creep + 1e-3 * wave * np.exp(-time_s))
     assert not comes_to_rest(creep + 2e-5 * wave)
     assert not comes_to_rest(np.where(time_s < 6, creep, np.inf))
