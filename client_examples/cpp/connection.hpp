@@ -1,6 +1,6 @@
 // A client's side of the wire: connect, learn what there is, take a contact, send commands, hear forces.
 //
-// Needs zenoh-cpp over zenoh-c or over zenoh-pico, and msgpack-c.
+// Needs zenoh-cpp over zenoh-c, and msgpack-c.
 #pragma once
 
 #include <atomic>
@@ -20,14 +20,6 @@
 #include "realtime.hpp"
 
 namespace palpate {
-
-#ifdef ZENOHCXX_ZENOHPICO  // which fixes these when it is built
-static_assert(Z_TRANSPORT_LEASE <= 1000,
-              "build zenoh-pico with -DZ_TRANSPORT_LEASE=1000, the time after which the "
-              "server notices that we are cut off");
-static_assert(Z_FRAG_MAX_SIZE >= 65536,
-              "build zenoh-pico with -DFRAG_MAX_SIZE=65536: it drops what is larger");
-#endif
 
 // There is no server, or it has gone; the message says which, in plain words.
 struct ServerGone : std::runtime_error {
@@ -86,9 +78,7 @@ class Connection {
         with_history.history = true;
         server_.emplace(zenoh_.liveliness_declare_subscriber(
             prefix_ + "/server",
-            [this](const zenoh::Sample& sample) {
-                (sample.get_kind() == Z_SAMPLE_KIND_PUT ? there_ : gone_) = true;
-            },
+            [this](const zenoh::Sample& sample) { (sample.get_kind() == Z_SAMPLE_KIND_PUT ? there_ : gone_) = true; },
             zenoh::closures::none, std::move(with_history)));
         statuses_.emplace(zenoh_.declare_subscriber(
             prefix_ + "/status", [this](const zenoh::Sample& sample) { guarded([&] { on_status(sample); }); },
@@ -176,7 +166,6 @@ class Connection {
     // Everything goes through the one endpoint, be it the server's or a router's; nothing is listened on or
     // looked for.
     static zenoh::Config configuration(const std::string& endpoint, const std::string& zenoh_config) {
-#ifdef ZENOHCXX_ZENOHC
         if (!zenoh_config.empty()) return zenoh::Config::from_file(zenoh_config);
         auto config = zenoh::Config::create_default();
         config.insert_json5("mode", R"("client")");
@@ -186,14 +175,6 @@ class Connection {
         config.insert_json5("scouting/multicast/enabled", "false");
         config.insert_json5("scouting/gossip/enabled", "false");
         config.insert_json5("transport/link/tx/lease", "1000");
-#else
-        if (!zenoh_config.empty())
-            throw Refused("zenoh-pico reads no configuration file: build with zenoh-c");
-        auto config = zenoh::Config::create_default();
-        config.insert(Z_CONFIG_MODE_KEY, Z_CONFIG_MODE_CLIENT);
-        config.insert(Z_CONFIG_CONNECT_KEY, endpoint.c_str());
-        config.insert(Z_CONFIG_MULTICAST_SCOUTING_KEY, "false");
-#endif
         return config;
     }
 
@@ -218,8 +199,7 @@ class Connection {
 
     void read_description(const msgpack::object& answer) {
         const auto version = field(answer, "schema_version").as<int>();
-        if (version != 1)
-            throw Refused("the server speaks schema version " + std::to_string(version) + ", we 1");
+        if (version != 1) throw Refused("the server speaks schema version " + std::to_string(version) + ", we 1");
         description_.model = field(field(answer, "model"), "config_sha256").as<std::string>();
         for (const auto& contact : field(answer, "contacts").as<std::vector<msgpack::object>>()) {
             description_.contacts.push_back(
@@ -242,14 +222,12 @@ class Connection {
         zenoh::Session::GetOptions options;
         options.timeout_ms = patience_ns / 1'000'000;
         if (request) options.payload = std::string_view(request->data(), request->size());
-        const auto replies =
-            zenoh_.get(prefix_ + "/" + key, "", zenoh::channels::FifoChannel(1), std::move(options));
+        const auto replies = zenoh_.get(prefix_ + "/" + key, "", zenoh::channels::FifoChannel(1), std::move(options));
         const auto received = replies.recv();
         if (const auto* reply = std::get_if<zenoh::Reply>(&received)) {
             if (reply->is_ok()) return unpack(reply->get_ok().get_payload());
             const auto& error = reply->get_err();
-            if (error.get_encoding().as_string().rfind("application/msgpack", 0) ==
-                0) {  // not Zenoh's own words
+            if (error.get_encoding().as_string().rfind("application/msgpack", 0) == 0) {  // not Zenoh's own words
                 const auto refusal = unpack(error.get_payload());
                 const auto reason = field(*refusal, "reason").as<std::string>();
                 const auto words = field(*refusal, "message").as<std::string>() + " (" + reason + ")";
@@ -257,8 +235,7 @@ class Connection {
                 throw Refused(words);
             }
         }
-        throw ServerGone("no server at " + place_ + " answers " + prefix_ + "/" + key +
-                         ", or it does not let us ask");
+        throw ServerGone("no server at " + place_ + " answers " + prefix_ + "/" + key + ", or it does not let us ask");
     }
 
     static msgpack::object_handle unpack(const zenoh::Bytes& payload) {
@@ -269,8 +246,7 @@ class Connection {
     static const msgpack::object& field(const msgpack::object& map, std::string_view name) {
         if (map.type != msgpack::type::MAP) throw std::runtime_error("the server sent no map");
         for (const auto& [key, value] : map.via.map) {
-            if (key.type == msgpack::type::STR &&
-                name == std::string_view(key.via.str.ptr, key.via.str.size)) {
+            if (key.type == msgpack::type::STR && name == std::string_view(key.via.str.ptr, key.via.str.size)) {
                 return value;
             }
         }

@@ -69,8 +69,7 @@ class RoundTrips {
     // none.
     std::optional<double> at(double share) const {
         if (count_ == 0) return std::nullopt;
-        const auto rank =
-            std::min(count_ - 1, static_cast<std::int64_t>(share * static_cast<double>(count_)));
+        const auto rank = std::min(count_ - 1, static_cast<std::int64_t>(share * static_cast<double>(count_)));
         std::int64_t below = 0;
         for (std::size_t i = 0; i + 1 < counts_.size(); ++i) {
             below += counts_[i];
@@ -111,19 +110,19 @@ class Contract {
 
     // Call it before the command is sent: the answer may come before the sending returns.
     void on_sent(std::int64_t sequence, std::int64_t client_time_ns) {
-        if (static_cast<double>(client_time_ns - newest_sent_ns_) > fade_ns_)
-            sending_since_ns_ = client_time_ns;
+        if (static_cast<double>(client_time_ns - newest_sent_ns_) > fade_ns_) sending_since_ns_ = client_time_ns;
         newest_sent_ns_ = client_time_ns;
         sent_[index(sequence)] = {sequence, client_time_ns};
         ++commands_;
     }
 
-    void on_force(const Force& f) {
+    // Whether this force may be rendered: finite, within the limit, newer than the last, and ours as far as we know.
+    bool on_force(const Force& f) {
         ++forces_;
         const double magnitude = length(f.force_n);
         if (!std::isfinite(f.force_n[0]) || !std::isfinite(f.force_n[1]) || !std::isfinite(f.force_n[2])) {
             broke(f.tick, "the force [%g, %g, %g] is not finite", f.force_n[0], f.force_n[1], f.force_n[2]);
-            return;
+            return false;
         }
         largest_force_n_ = std::max(largest_force_n_, magnitude);
         if (magnitude > max_force_n_ + slack) {
@@ -139,20 +138,24 @@ class Contract {
         if (holding_ && f.sequence < 0 && newest_answered_ >= 0) {
             // The server keeps a holder's last command, however silent the holder is.
             holding_ = false;
-            broke(
-                f.tick,
-                "we no longer hold the contact, our commands are forgotten: it was released or taken back "
-                "(after a second of silence, for instance), or the server has stopped or was started again");
+            broke(f.tick,
+                  "we no longer hold the contact, our commands are forgotten: it was released or taken back "
+                  "(after a second of silence, for instance), or the server has stopped or was started again");
             last_.reset();  // another server counts its own ticks
-            return;
+            return false;
         }
-        if (!follows(f)) return;
+        if (!follows(f)) return false;
         last_ = f;
         check_answer(f);
+        return magnitude <= max_force_n_ + slack;
     }
+
+    // What was measured until now does not count.
+    void measure_anew() { round_trips_ = {}; }
 
     bool holding() const { return holding_; }  // as far as we know
     std::int64_t commands() const { return commands_; }
+    std::int64_t answered() const { return answered_; }
     std::int64_t forces() const { return forces_; }
     std::int64_t lost_ticks() const { return lost_ticks_; }
     double largest_force_n() const { return largest_force_n_; }
@@ -160,10 +163,9 @@ class Contract {
     const std::vector<std::string>& broken() const { return broken_; }
 
  private:
-    static constexpr double slack = 1e-9;  // of a newton: rounding
-    static constexpr std::int64_t remembered =
-        10'000;                              // commands: answers to older ones break the contract anyway
-    static constexpr std::size_t told = 20;  // one cause can break every tick; the first ones tell
+    static constexpr double slack = 1e-9;               // of a newton: rounding
+    static constexpr std::int64_t remembered = 10'000;  // commands: answers to older ones break the contract anyway
+    static constexpr std::size_t told = 20;             // one cause can break every tick; the first ones tell
     // A busy machine or network may hold commands up until the force has faded, which the flags tell and
     // nobody has promised to prevent. A link on which nothing moves for as long as this is closed, so that
     // then it is not the link.
@@ -173,9 +175,7 @@ class Contract {
         std::int64_t sequence = -1, client_time_ns = 0;
     };
 
-    static std::size_t index(std::int64_t sequence) {
-        return static_cast<std::size_t>(sequence % remembered);
-    }
+    static std::size_t index(std::int64_t sequence) { return static_cast<std::size_t>(sequence % remembered); }
 
     bool follows(const Force& f) {
         if (!last_) return true;
@@ -189,8 +189,8 @@ class Contract {
             broke(f.tick, "the force jumped by %g N in one tick", step);
         }
         if (holding_ && f.sequence >= 0 && f.sequence < last_->sequence) {
-            broke(f.tick, "it answers command %lld, the tick before answered %lld",
-                  static_cast<long long>(f.sequence), static_cast<long long>(last_->sequence));
+            broke(f.tick, "it answers command %lld, the tick before answered %lld", static_cast<long long>(f.sequence),
+                  static_cast<long long>(last_->sequence));
         }
         return true;
     }
@@ -201,6 +201,7 @@ class Contract {
         if (sent.sequence == f.sequence && sent.client_time_ns == f.client_time_ns) {
             if (f.sequence > newest_answered_) {
                 newest_answered_ = f.sequence;
+                ++answered_;
                 round_trips_.add(f.arrival_ns - sent.client_time_ns);
             }
             if (holding_) check_heard(f, sent.client_time_ns);
@@ -241,7 +242,7 @@ class Contract {
     double max_force_n_, max_step_n_, hold_ns_, fade_ns_;
     bool holding_ = false, unheard_ = false;
     std::vector<Sent> sent_ = std::vector<Sent>(remembered);
-    std::int64_t commands_ = 0, forces_ = 0, lost_ticks_ = 0, newest_answered_ = -1;
+    std::int64_t commands_ = 0, answered_ = 0, forces_ = 0, lost_ticks_ = 0, newest_answered_ = -1;
     std::int64_t newest_sent_ns_ = 0,
                  sending_since_ns_ = 0;  // since: without a pause in which our force would fade
     double largest_force_n_ = 0.0;

@@ -1,5 +1,4 @@
-// Close the loop with a haptic device: read its position, send it, render the force. The device is in
-// DEVICE_HEADER.
+// Close the loop with a haptic device: read its position, send it, render the force.
 //
 // Whatever ends it, the device is left without a force. Exit code 0: all well. 1: the contract was broken,
 // the contact was lost or the server went away. 2: it could not start. 130: Ctrl-C or SIGTERM.
@@ -32,16 +31,16 @@ namespace {
 // First in, first out. Zenoh's threads below the loop, which has to let go whatever they do, and both below
 // the server's, which may be on the same machine.
 constexpr int loop_priority = 60, zenoh_priority = 55;
-constexpr double measure_s = 1.0;  // of round trips: a thousand
+// The server's deadlines move to where our commands come, in a quarter of a second; then round trips are measured.
+constexpr double settle_s = 0.5, measure_s = 1.0;
 
 struct Options {
-    std::string connect = "tcp/127.0.0.1:7447", zenoh_config, session = "main", name, contact,
-                device = "generic";
+    std::string connect = "tcp/127.0.0.1:7447", zenoh_config, session = "main", name, contact, device = "generic";
     double silence_s = 0.1, wait_s = 0.0, duration_s = 5.0;
 };
 
-std::atomic<bool> driving{false},
-    interrupted{false};  // both lock-free, so that a signal's handler may use them
+// Both lock-free, so that a signal's handler may use them.
+std::atomic<bool> driving{false}, interrupted{false};
 
 void on_signal(int) {
     if (!driving) _exit(130);  // nothing is rendered; our contact is free as soon as our token is gone
@@ -85,32 +84,36 @@ class Bridge {
         } catch (const Refused&) {
         }
         contract_.agree(connection_.acquire(contact_.name, std::nullopt).max_force_n);
-        measure();
+        rest(settle_s);
+        contract_.measure_anew();
+        rest(measure_s);
+        std::this_thread::sleep_for(std::chrono::milliseconds(50));  // the last answers are still under way
+        take_forces();
         const auto told = contract_.round_trips().at(0.99);
         if (!told) throw ServerGone("no command was answered");
         round_trip_s_ = *told;
         contract_.release();
-        const auto agreed = connection_.acquire(
-            contact_.name, DeviceTerms{options_.device, Device::damping_n_s_per_m, round_trip_s_});
+        const auto agreed =
+            connection_.acquire(contact_.name, DeviceTerms{options_.device, Device::damping_n_s_per_m, round_trip_s_});
         take_forces();  // those of before
         contract_.agree(agreed.max_force_n);
         for (const auto& warning : agreed.warnings) std::cerr << "warning: " << warning << '\n';
     }
 
-    // The loop: until the time is over, a signal comes, or something is lost, which it returns in plain
-    // words.
+    // The loop: until the time is over, a signal comes, or something is lost, which it returns in plain words.
     std::optional<std::string> drive(Device& device, std::int64_t end_ns) {
         const Driving guard(device);
-        Deadlines deadlines(period_ns_);
+        deadlines_.wait();
+        const std::int64_t missed_before = deadlines_.missed();
         std::optional<std::string> trouble;
         while (!interrupted && now_ns() < end_ns) {
             take_forces();
             if ((trouble = lost())) break;
             step(device);
             device.move(static_cast<double>(period_ns_) * 1e-9);  // leave it out: a real one moves by itself
-            deadlines.wait();
+            deadlines_.wait();
         }
-        missed_ = deadlines.missed();
+        missed_ = deadlines_.missed() - missed_before;
         return trouble;
     }
 
@@ -127,22 +130,21 @@ class Bridge {
         return std::nullopt;
     }
 
-    bool well() const { return contract_.broken().empty() && contract_.round_trips().count() > 0; }
+    bool well() const { return contract_.broken().empty() && contract_.answered() > 0; }
 
     void print_summary() const {
         const auto& trips = contract_.round_trips();
         const auto microseconds = [](std::optional<double> seconds) {
             return seconds ? std::to_string(std::llround(*seconds * 1e6)) : "-";
         };
-        std::cout << "commands answered  " << trips.count() << " of " << contract_.commands() << '\n'
-                  << "forces             " << contract_.forces() << " received, " << contract_.lost_ticks()
-                  << " lost\n"
+        std::cout << "commands answered  " << contract_.answered() << " of " << contract_.commands() << '\n'
+                  << "forces             " << contract_.forces() << " received, " << contract_.lost_ticks() << " lost\n"
                   << "deadlines missed   " << missed_ << '\n'
                   << "round trip told    " << microseconds(round_trip_s_)
                   << " microseconds, before the device was moved\n"
                   << "round trip         p50 " << microseconds(trips.at(0.5)) << ", p99 "
-                  << microseconds(trips.at(0.99)) << ", p99.9 " << microseconds(trips.at(0.999))
-                  << ", longest " << microseconds(trips.longest()) << " microseconds\n"
+                  << microseconds(trips.at(0.99)) << ", p99.9 " << microseconds(trips.at(0.999)) << ", longest "
+                  << microseconds(trips.longest()) << " microseconds\n"
                   << "deepest position   " << deepest_m_ * 1e3 << " mm\n"
                   << "largest force      " << contract_.largest_force_n() << " N\n"
                   << "contract           " << (contract_.broken().empty() ? "held" : "BROKEN") << std::endl;
@@ -170,17 +172,14 @@ class Bridge {
         send(command);
     }
 
-    // The round trips of commands that keep the tip at rest, rendering nothing.
-    void measure() {
-        Deadlines deadlines(period_ns_);
-        const std::int64_t end_ns = now_ns() + std::llround(measure_s * 1e9);
+    // Commands that keep the tip at rest, rendering nothing.
+    void rest(double seconds) {
+        const std::int64_t end_ns = now_ns() + std::llround(seconds * 1e9);
         while (now_ns() < end_ns && !connection_.gone()) {
             take_forces();
             send(Command{});
-            deadlines.wait();
+            deadlines_.wait();
         }
-        std::this_thread::sleep_for(std::chrono::milliseconds(50));  // the last answers are still under way
-        take_forces();
     }
 
     void send(Command command) {
@@ -190,14 +189,15 @@ class Bridge {
         connection_.send(command);
     }
 
-    // All that have come are checked; only the newest is rendered.
+    // All that have come are checked; only the newest is rendered, and none that may not be.
     void take_forces() {
-        while (connection_.take(newest_)) contract_.on_force(newest_);
+        for (Force force; connection_.take(force);) {
+            if (contract_.on_force(force)) newest_ = force;
+        }
     }
 
     std::optional<std::string> lost() const {
-        if (connection_.gone())
-            return "the server is gone, or the link to it: its liveliness token was taken back";
+        if (connection_.gone()) return "the server is gone, or the link to it: its liveliness token was taken back";
         if (connection_.stopping()) return "the server is stopping";
         if (connection_.unreadable()) return "the server sent what can't be read";
         if (!contract_.holding()) return "the contact is no longer ours";
@@ -212,6 +212,7 @@ class Bridge {
     const Vec3 inwards_;
     const Options& options_;
     std::int64_t period_ns_;
+    Deadlines deadlines_{period_ns_};
     Contract contract_;
     Gate gate_;
     Force newest_;
@@ -231,7 +232,7 @@ std::size_t find_contact(const Description& description, const std::string& name
 }
 
 int run(const Options& options) {
-    for (const auto& notice : {lock_memory(), raise_priority(zenoh_priority)}) {
+    for (const auto& notice : {lock_memory(), raise_priority(loop_priority)}) {
         if (notice) std::cerr << "notice: " << *notice << '\n';
     }
     std::optional<Device> device;
@@ -242,13 +243,14 @@ int run(const Options& options) {
     // When something is lost all is agreed anew, if that is wanted: nothing of the old agreement holds.
     for (;;) {
         try {
-            raise_priority(zenoh_priority);  // its threads inherit it
+            raise_priority(zenoh_priority);  // Zenoh's threads inherit it
             Connection connection(options.connect, options.zenoh_config, options.session, options.name);
             raise_priority(loop_priority);
             const auto& description = connection.description();
             const std::size_t contact = find_contact(description, options.contact);
             if (!device) {
                 device.emplace(-1.0 * description.contacts[contact].normal);
+                device->render({});
                 model = description.model;
             } else if (description.model != model) {
                 throw Refused("the server that came again runs another model");
@@ -327,8 +329,7 @@ Options parse(int argc, char** argv) {
     }
     // They become parts of keys.
     const std::string plain = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789_-";
-    for (const auto& [name, text] :
-         {std::pair("session", options.session), std::pair("name", options.name)}) {
+    for (const auto& [name, text] : {std::pair("session", options.session), std::pair("name", options.name)}) {
         if (text.empty() || text.size() > 64 || text.find_first_not_of(plain) != std::string::npos) {
             wrong(name, text, "1 to 64 of A-Z a-z 0-9 _ -");
         }

@@ -38,8 +38,7 @@ class Deadlines {
             missed_ += late;
             next_ns_ += late * period_ns_;
         }
-        const timespec t{static_cast<time_t>(next_ns_ / 1'000'000'000),
-                         static_cast<long>(next_ns_ % 1'000'000'000)};
+        const timespec t{static_cast<time_t>(next_ns_ / 1'000'000'000), static_cast<long>(next_ns_ % 1'000'000'000)};
         clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, nullptr);
     }
 
@@ -56,15 +55,13 @@ inline std::optional<std::string> raise_priority(int priority) {
     const int error = pthread_setschedparam(pthread_self(), SCHED_FIFO, &parameter);
     if (!error) return std::nullopt;
     return std::string("no real-time scheduling (") + std::strerror(error) +
-           "): expect missed deadlines on a busy machine; allow it with `ulimit -r " +
-           std::to_string(priority) + "`";
+           "): expect missed deadlines on a busy machine; allow it with `ulimit -r " + std::to_string(priority) + "`";
 }
 
 // Keep the process's memory from being swapped out; or say why not.
 inline std::optional<std::string> lock_memory() {
     if (!mlockall(MCL_CURRENT | MCL_FUTURE)) return std::nullopt;
-    return std::string("memory is not locked (") + std::strerror(errno) +
-           "): allow it with `ulimit -l unlimited`";
+    return std::string("memory is not locked (") + std::strerror(errno) + "): allow it with `ulimit -l unlimited`";
 }
 
 // From one thread to one other, neither of which ever waits for the other; what comes while it is full is

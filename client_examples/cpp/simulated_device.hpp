@@ -32,8 +32,7 @@ class Device {
     // second, on a handle of some mass. Semi-implicit Euler: as simple as it gets, and it does not gain
     // energy by itself.
     void move(double seconds) {
-        constexpr double mass_kg = 0.1, hand_n_per_m = 100.0, reach_m = 0.01,
-                         turn = 2 * 3.14159265358979323846;
+        constexpr double mass_kg = 0.1, hand_n_per_m = 100.0, reach_m = 0.01, turn = 2 * 3.14159265358979323846;
         const double wanted = reach_m * (1 - std::cos(turn * time_)) / 2;
         const double hand = hand_n_per_m * (wanted - position_);
         velocity_ += (hand + force_ - damping_n_s_per_m * velocity_) / mass_kg * seconds;

@@ -1,7 +1,7 @@
 """The bridge in C++: its contract beside the one in Python, and the whole of it, built and run as a user does.
 
-The contract and the queue need a C++ compiler. The bridge needs cmake, msgpack's C++ headers, and zenoh-cpp over zenoh-c or
-zenoh-pico; where they are not in the system, CMAKE_PREFIX_PATH tells where. What is not there is skipped.
+The contract and the queue need a C++ compiler. The bridge needs cmake, msgpack's C++ headers, zenoh-c and
+zenoh-cpp; where they are not in the system, CMAKE_PREFIX_PATH tells where. What is not there is skipped.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ void check_contract() {{
     promise.decaying = {int(Flags.DECAYING)};
     promise.stale = {int(Flags.STALE)};
     palpate::Contract contract(promise);
+    std::string may_be_rendered;
     for (std::string word; std::cin >> word;) {{
         if (word == "agree") contract.agree(1.0);
         if (word == "release") contract.release();
@@ -65,15 +66,16 @@ void check_contract() {{
             std::string x;
             std::cin >> f.tick >> f.sequence >> f.client_time_ns >> f.input_age_ns >> f.flags >> x >> f.arrival_ns;
             f.force_n[0] = std::stod(x);
-            contract.on_force(f);
+            may_be_rendered += contract.on_force(f) ? '1' : '0';
         }}
     }}
     const auto& trips = contract.round_trips();
     std::cout.precision(17);
     std::cout << contract.holding() << ' ' << contract.commands() << ' ' << contract.forces() << ' '
-              << contract.lost_ticks() << ' ' << trips.count() << ' ' << contract.largest_force_n() << ' '
+              << contract.lost_ticks() << ' ' << contract.answered() << ' ' << contract.largest_force_n() << ' '
               << trips.at(0.5).value_or(-1) << ' ' << trips.at(0.99).value_or(-1) << ' '
-              << trips.longest().value_or(-1) << '\\n';
+              << trips.longest().value_or(-1) << '\\n'
+              << may_be_rendered << '\\n';
     for (const auto& line : contract.broken()) std::cout << line << '\\n';
 }}
 
@@ -184,7 +186,7 @@ def troubled_conversation(seed: int) -> list[tuple[Any, ...]]:
             flags = int(Flags.STALE if newest < 0 or age > HOLD_NS + DECAY_NS else Flags.DECAYING)
         force = 0.0 if flags & Flags.STALE else max(-1.0, min(1.0, force + dice.uniform(-0.5, 0.5)))
         tick += 1
-        told = {
+        told: dict[str, Any] = {
             "tick": tick,
             "sequence": newest,
             "client_time_ns": sent.get(newest, -1),
@@ -258,7 +260,9 @@ def test_the_contract_says_the_same_in_both_languages(listen: Callable[..., str]
     for seed in SEEDS:
         said = troubled_conversation(seed)
         numbers, broken = in_python(said)
-        first, *lines = listen("contract", "\n".join(" ".join(map(str, line)) for line in said)).splitlines()
+        first, _, *lines = listen(
+            "contract", "\n".join(" ".join(map(str, line)) for line in said)
+        ).splitlines()
         *counts, p50, p99, longest = map(float, first.split())
         assert counts == [float(n) for n in numbers[:6]], seed
         assert without_numbers(lines) == without_numbers(broken), seed
@@ -270,6 +274,19 @@ def test_the_contract_says_the_same_in_both_languages(listen: Callable[..., str]
             )  # counted by the microsecond
         heard |= {line.partition(": ")[2] for line in without_numbers(broken)}
     assert len(heard) == 10, heard  # each way to break it came up
+
+
+def test_a_force_that_breaks_the_contract_is_not_rendered(listen: Callable[..., str]) -> None:
+    forces = [
+        (10, "0.9", 1),
+        (11, "nan", 0),
+        (12, "-inf", 0),
+        (13, "1.1", 0),  # N; the limit is 1
+        (12, "0.5", 0),  # late
+        (14, "0.5", 1),
+    ]
+    told = "\n".join(f"force {tick} -1 -1 -1 {int(Flags.DECAYING)} {force} 0" for tick, force, _ in forces)
+    assert listen("contract", told).splitlines()[1] == "".join(str(may) for _, _, may in forces)
 
 
 def test_the_tip_stays_out_after_a_gap_until_the_hand_has_left_the_tissue(listen: Callable[..., str]) -> None:
