@@ -8,6 +8,7 @@ The end of the pipe ends the file, also when the server was killed; nothing else
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -128,7 +129,8 @@ def main() -> int:
     stream = sys.stdout.buffer
     try:
         recording = Recording(stream)
-        for message in msgpack.Unpacker(sys.stdin.buffer, raw=False):
+        # Unbuffered: a buffered one would wait for a megabyte, which is four seconds of ticks.
+        for message in msgpack.Unpacker(io.FileIO(sys.stdin.fileno()), raw=False):
             recording.add(*message)
         recording.finish()
         stream.flush()

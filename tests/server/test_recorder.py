@@ -111,6 +111,25 @@ def test_commands_and_ticks_are_all_in_the_file_each_command_before_its_tick(
 
 
 @pytest.mark.usefixtures("patiently")
+def test_what_is_recorded_is_soon_in_the_file(memory: layout.Memory, tmp_path: Path) -> None:
+    """A crash of the machine would lose the rest."""
+
+    def forces() -> int:
+        try:
+            return len(replay.read_session(tmp_path / "a.mcap").forces)
+        except replay.ReplayError:  # nothing yet
+            return 0
+
+    recording = Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)
+    run(recording, memory, 300)
+    give_up = time.monotonic() + 60.0
+    while forces() < 100:
+        assert time.monotonic() < give_up
+        time.sleep(0.05)
+    recording.stop()
+
+
+@pytest.mark.usefixtures("patiently")
 def test_ticks_that_were_overwritten_before_they_were_taken_are_counted(
     memory: layout.Memory, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
