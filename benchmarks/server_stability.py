@@ -12,7 +12,7 @@ three ticks old. The model is made softer and stiffer; so are a sample, and a sp
 Colgate & Schenkel (1997): a sampled spring K can't make any passive hand vibrate when b > K (T/2 + D), b being the damping
 of handle and hand, D the time from a position to its force: here the 99th percentile of the age of the forces rendered.
 
-Prints the region and how it compares with that bound, and draws it; takes some ten minutes. The first of them want a quiet
+Prints the region and how it compares with that bound, and draws it, in a quarter of an hour. The first minute of it wants a quiet
 machine: a client that is away for more than 20 ms loses its force for a moment, which knocks the handle, and one that is
 knocked again and again never comes to rest.
 """
