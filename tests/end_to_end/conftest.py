@@ -43,7 +43,7 @@ def wait_for(
     """What `look` returns as soon as that meets the condition."""
     give_up = time.monotonic() + seconds
     while not condition(seen := look()):
-        assert time.monotonic() < give_up, f"waited {seconds:g} s for {what}; last seen: {seen!r}"
+        assert time.monotonic() < give_up, f"waited {seconds:g} s for {what}; last seen: {repr(seen)[-2000:]}"
         time.sleep(0.005)
     return seen
 

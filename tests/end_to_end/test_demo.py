@@ -43,10 +43,10 @@ def test_the_demonstration_ends_with_forces_and_a_picture_and_builds_once(
     assert np.std(picture[..., :3]) > 0.05  # not blank
 
     again = Stages()
-    run_demo(scene, tmp_path / "out", 1.0, again)
+    run_demo(scene, tmp_path / "out", 0.2, again)
     assert not any(name.startswith("reduction") for name in again.names)
 
     scene.write_text(slab_scene(("tip", 0.03, 0.015)))
     changed = Stages()
-    run_demo(scene, tmp_path / "out", 1.0, changed)
+    run_demo(scene, tmp_path / "out", 0.2, changed)
     assert any(name.startswith("reduction") for name in changed.names)
