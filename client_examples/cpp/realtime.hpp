@@ -5,7 +5,9 @@
 #include <pthread.h>
 #include <sched.h>
 #include <sys/mman.h>
+#include <sys/resource.h>
 #include <time.h>
+#include <unistd.h>
 
 #include <array>
 #include <atomic>
@@ -60,8 +62,13 @@ inline std::optional<std::string> raise_priority(int priority) {
 
 // Keep the process's memory from being swapped out; or say why not.
 inline std::optional<std::string> lock_memory() {
-    if (!mlockall(MCL_CURRENT | MCL_FUTURE)) return std::nullopt;
-    return std::string("memory is not locked (") + std::strerror(errno) + "): allow it with `ulimit -l unlimited`";
+    rlimit limit{};
+    getrlimit(RLIMIT_MEMLOCK, &limit);
+    // With a limit a later allocation would fail.
+    const bool limited = limit.rlim_cur != RLIM_INFINITY && geteuid() != 0;
+    if (!limited && !mlockall(MCL_CURRENT | MCL_FUTURE)) return std::nullopt;
+    return std::string("memory is not locked (") + std::strerror(limited ? EPERM : errno) +
+           "): allow it with `ulimit -l unlimited`";
 }
 
 // From one thread to one other, neither of which ever waits for the other; what comes while it is full is
