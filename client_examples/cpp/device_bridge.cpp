@@ -13,7 +13,6 @@
 #include <csignal>
 #include <cstdlib>
 #include <iostream>
-#include <memory>
 #include <optional>
 #include <random>
 #include <string>
@@ -110,7 +109,7 @@ class Bridge {
             take_forces();
             if ((trouble = lost())) break;
             step(device);
-            device.move(static_cast<double>(period_ns_) * 1e-9);  // leave it out: a real one moves by itself
+            device.move(static_cast<double>(period_ns_) * 1e-9);
             deadlines_.wait();
         }
         missed_ = deadlines_.missed() - missed_before;

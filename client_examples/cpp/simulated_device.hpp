@@ -1,6 +1,5 @@
-// The place where your device goes: copy this file, write the same four functions around the driver, and
-// build with `cmake -DDEVICE_HEADER=/path/to/your_device.hpp`. This one is a handle that a simulated hand
-// moves.
+// The place where your device goes: copy this file, write the same functions around the driver, and build with
+// `cmake -DDEVICE_HEADER=/path/to/your_device.hpp`. This one is a handle that a simulated hand moves.
 #pragma once
 
 #include <cmath>
@@ -11,26 +10,24 @@ namespace palpate {
 
 class Device {
  public:
-    // What the device itself damps: with the round trip, the server can tell from it whether the device might
-    // vibrate.
+    // What the device itself damps: with the round trip, the server can tell from it whether the device might vibrate.
     static constexpr double damping_n_s_per_m = 0.5;
 
-    // Of a device that has to be opened, do it here, and throw std::runtime_error when that fails. `inwards`
-    // is a direction of length 1, into the tissue.
+    // A device that has to be opened is opened here; std::runtime_error when that fails. `inwards` is a direction of
+    // length 1, into the tissue.
     explicit Device(const Vec3& inwards) : inwards_(inwards) {}
 
-    // Where the tip is, m from the undeformed surface at the contact, and how fast, m/s, along the model's
-    // axes.
+    // Where the tip is, m from the undeformed surface at the contact, and how fast, m/s, along the model's axes. A
+    // device with axes of its own turns its positions into the model's, and forces back.
     Vec3 position_m() const { return position_ * inwards_; }
     Vec3 velocity_m_per_s() const { return velocity_ * inwards_; }
 
-    // The force on the hand from now on, N. The motors keep it until the next call, so the last one is always
-    // zero.
+    // The force on the hand from now on, N. The motors keep it until the next call, so the last one is always zero.
     void render(const Vec3& force_n) { force_ = dot(force_n, inwards_); }
 
-    // What a hand does to a real device: a spring to where the person wants to be, 10 mm in and back once a
-    // second, on a handle of some mass. Semi-implicit Euler: as simple as it gets, and it does not gain
-    // energy by itself.
+    // A real device is moved by a hand: leave this empty. Here the hand is a spring to where the person wants to be,
+    // 10 mm in and back once a second, on a handle of some mass. Semi-implicit Euler: as simple as it gets, and it does
+    // not gain energy by itself.
     void move(double seconds) {
         constexpr double mass_kg = 0.1, hand_n_per_m = 100.0, reach_m = 0.01, turn = 2 * 3.14159265358979323846;
         const double wanted = reach_m * (1 - std::cos(turn * time_)) / 2;
