@@ -1,6 +1,6 @@
 """A client's side of the wire: connect, learn what there is, take contacts, send commands, hear forces.
 
-Needs `eclipse-zenoh` and `msgpack`. In another language the same few calls of zenoh-c, zenoh-cpp or zenoh-pico do it.
+Needs `eclipse-zenoh` and `msgpack`. In another language the same few calls of Zenoh do it: `cpp/` is this in C++.
 """
 
 import argparse
@@ -172,8 +172,12 @@ def _configuration(endpoint, zenoh_config):
 
 
 def steps(duration_s, period_s):
-    """Give 0, 1, 2, ..., one each period. Deadlines count from the start, not from the last one: errors don't add up."""
-    start = time.monotonic()
+    """Give 0, 1, 2, ..., one each period. Deadlines count from the start, not from the last one: errors don't add up.
+
+    They are multiples of the period on our clock: the server's own deadlines, which follow ours, need not move when one
+    loop takes over from another.
+    """
+    start = math.ceil(time.monotonic() / period_s) * period_s
     for i in range(round(duration_s / period_s)):
         wait = start + i * period_s - time.monotonic()
         if wait > 0:

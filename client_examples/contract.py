@@ -25,6 +25,7 @@ class Contract:
         self.holding = False  # the contact, as far as we know
         self.sent = {}  # sequence -> client_time_ns, the newest REMEMBERED ones
         self.commands = 0
+        self.answered = 0
         self.newest_answered = -1
         self.round_trips_ns = array.array("q")  # an hour of them is 29 MB
         self.forces = 0
@@ -57,6 +58,7 @@ class Contract:
         self.sent.pop(command["sequence"] - REMEMBERED, None)
 
     def on_force(self, message, arrival_ns):
+        """Whether this force may be rendered: finite, within the limit, newer than the last, and ours as far as we know."""
         i = self.index
         tick, sequence, flags = message["tick"], message["sequence"][i], message["flags"][i]
         force = message["force_n"][i]
@@ -67,7 +69,7 @@ class Contract:
 
         if not all(math.isfinite(f) for f in force):
             self._break(tick, f"the force {force} is not finite")
-            return
+            return False
         magnitude = math.hypot(*force)
         self.largest_force_n = max(self.largest_force_n, magnitude)
         if magnitude > self.max_force_n + SLACK:
@@ -87,13 +89,13 @@ class Contract:
                 "(after a second of silence, for instance), or the server has stopped or was started again",
             )
             self._last = None  # another server counts its own ticks
-            return
+            return False
 
         if self._last is not None:
             last_tick, last_sequence, last_force = self._last
             if tick <= last_tick:
                 self._break(tick, f"it came after tick {last_tick}")
-                return
+                return False
             self.lost_ticks += tick - last_tick - 1
             if tick == last_tick + 1 and math.dist(force, last_force) > self.max_step_n + SLACK:
                 self._break(tick, f"the force jumped by {math.dist(force, last_force)} N in one tick")
@@ -104,11 +106,17 @@ class Contract:
         if self.sent.get(sequence) == message["client_time_ns"][i]:
             if sequence > self.newest_answered:
                 self.newest_answered = sequence
+                self.answered += 1
                 self.round_trips_ns.append(arrival_ns - self.sent[sequence])
             if self.holding:
                 self._check_heard(tick, sequence, message["input_age_ns"][i], flags & self.flags["STALE"])
         elif self.holding and sequence >= 0:  # while we don't hold the contact, others' are answered
             self._break(tick, f"it answers command {sequence}, which was not sent (or not at that time)")
+        return magnitude <= self.max_force_n + SLACK
+
+    def measure_anew(self):
+        """Round trips that were measured until now do not count."""
+        self.round_trips_ns = array.array("q")
 
     def _check_heard(self, tick, sequence, age_ns, stale):
         """That the force has faded is our own doing when we were silent, but not while we went on sending.
@@ -140,8 +148,8 @@ class Contract:
 
         return {
             "commands_sent": self.commands,
-            "commands_answered": len(ordered),
-            "commands_unanswered": self.commands - len(ordered),
+            "commands_answered": self.answered,
+            "commands_unanswered": self.commands - self.answered,
             "forces_received": self.forces,
             "forces_lost": self.lost_ticks,
             "round_trip_s": {"p50": at(0.5), "p99": at(0.99), "p99_9": at(0.999), "max": at(1.0)},

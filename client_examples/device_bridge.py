@@ -11,12 +11,14 @@ import argparse
 import math
 import signal
 import sys
+import threading
 import time
 
 import zenoh
 from connection import Connection, Refused, ServerGone, plain_name, positive, steps
 from contract import Contract
 
+SETTLE_S = 0.5  # the server's deadlines move to where our commands come, in a quarter of a second
 MEASURE_S = 1.0  # of round trips: a thousand
 FORCE_HOLD_S = (
     0.02  # that a force is rendered for without a newer one: as long as the server holds a silent input
@@ -65,9 +67,15 @@ def run(connection, options):
     contract = Contract(connection.description, contact["name"])
     inwards = [-n for n in contact["normal"]]
     newest = {"force": 0.0, "tick": None, "heard": time.monotonic()}
+    stopping = threading.Event()
+
+    def on_status(status):
+        if status["state"] == "stopping":
+            stopping.set()
 
     def on_force(message, arrival_ns):
-        contract.on_force(message, arrival_ns)
+        if not contract.on_force(message, arrival_ns):
+            return  # what may not be rendered is as good as silence
         # The message holds what the tip does to the tissue; the hand feels the opposite. Along the line of motion:
         force = message["force_n"][contract.index]
         newest["force"] = -sum(f * n for f, n in zip(force, inwards, strict=True))
@@ -75,6 +83,7 @@ def run(connection, options):
         newest["heard"] = time.monotonic()
 
     connection.on_force(on_force)
+    connection.on_status(on_status)
     device = SimulatedDevice(options.mass_kg, options.damping_n_s_per_m, options.hand_n_per_m)
     contract.agree(connection.acquire([contact["name"]]))
     round_trip_s = measure(connection, contract, contact)
@@ -103,6 +112,8 @@ def run(connection, options):
             silence_s = time.monotonic() - newest["heard"]
             if connection.gone.is_set():
                 trouble = "the server is gone, or the link to it: its liveliness token was taken back"
+            elif stopping.is_set():
+                trouble = "the server is stopping"
             elif not contract.holding:
                 trouble = "the contact is no longer ours"
             elif silence_s > options.silence_s:
@@ -129,7 +140,9 @@ def run(connection, options):
             deepest = max(deepest, device.position_m)
     finally:
         device.render(0.0)  # or the motors would keep the last force, however this ends
-    if not trouble:
+    if trouble:
+        contract.release()  # what comes from now on is no answer to us
+    else:
         time.sleep(0.05)  # the last answers are still under way
         contract.release()
         try:
@@ -140,7 +153,7 @@ def run(connection, options):
     summary = contract.summary()
     trip = summary["round_trip_s"]["p50"]
     print(f"commands answered  {summary['commands_answered']} of {summary['commands_sent']}")
-    print(f"round trip told    {round_trip_s * 1e6:.0f} microseconds, before the device was moved")
+    print(f"round trip told    {round_trip_s * 1e6:.0f} microseconds, until rendered")
     print(f"round trip p50     {'-' if trip is None else f'{trip * 1e6:.0f}'} microseconds")
     print(
         f"deepest position   {deepest * 1e3:.2f} mm of the {options.reach_m * 1e3:.2f} mm that the hand reached for"
@@ -154,14 +167,22 @@ def run(connection, options):
 
 
 def measure(connection, contract, contact):
-    """The round trip that 99 of 100 commands stay below, s: of commands that keep the tip at rest, rendering nothing."""
+    """The age that 99 of 100 forces stay below when they are rendered, s; None when no command was answered.
+
+    Measured with commands that keep the tip at rest, rendering nothing: the round trip, and up to a period until the next
+    step of ours.
+    """
     at_rest = {contact["name"]: [0.0, 0.0, 0.0]}
-    for _ in steps(MEASURE_S, connection.description["period_s"]):
-        command = connection.command(at_rest)
-        contract.on_sent(command)
-        connection.send(command)
+    period = connection.description["period_s"]
+    for seconds in (SETTLE_S, MEASURE_S):
+        contract.measure_anew()
+        for _ in steps(seconds, period):
+            command = connection.command(at_rest)
+            contract.on_sent(command)
+            connection.send(command)
     time.sleep(0.05)  # the last answers are still under way
-    return contract.summary()["round_trip_s"]["p99"]
+    heard = contract.summary()["round_trip_s"]["p99"]
+    return None if heard is None else heard + period
 
 
 def parse_options():

@@ -125,11 +125,11 @@ class Server:
         self._declared.append(session.liveliness().declare_token(keys.server))
 
     def stop(self) -> None:
-        """Let the forces fade, say so in a last status, stop the loop and take everything back from the session."""
+        """Say so, let the forces fade, stop the loop and take everything back from the session."""
         service = self.service
-        service.state = "stopping"
-        service.forget_commands(service.names)
-        time.sleep((safety.DECAY_NS * 1e-9) + 10 * service.model.period_s)
+        service.state = "stopping"  # from here on commands are refused, and forces fade as after silence
+        self.publish_status()
+        time.sleep((safety.HOLD_NS + safety.DECAY_NS) * 1e-9 + 10 * service.model.period_s)
         self.publish_status()
         service.stopping.set()
         loop.stop(service.memory.shared)

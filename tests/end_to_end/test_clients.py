@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import signal
 import socket
@@ -63,8 +64,14 @@ class Conversation:
         self.contract.on_sent({"sequence": sequence, "client_time_ns": at_ms * MS})
         return sequence
 
-    def tick(self, at_ms: int, newest: int, heard_ms: int | None = None) -> None:
-        """The tick at a time, whose newest command is `newest` (-1: none), heard at once or later."""
+    def tick(
+        self,
+        at_ms: int,
+        newest: int,
+        heard_ms: int | None = None,
+        force_n: tuple[float, ...] = (0.0, 0.0, 0.0),
+    ) -> bool:
+        """The tick at a time, whose newest command is `newest` (-1: none), heard at once or later; may it be rendered?"""
         age_ms = at_ms - self.sent_ms[newest] - 1 if newest >= 0 else -1
         flags = 0
         if not 0 <= age_ms * MS <= HOLD_NS:
@@ -75,9 +82,9 @@ class Conversation:
             "client_time_ns": [self.sent_ms[newest] * MS if newest >= 0 else -1],
             "input_age_ns": [age_ms * MS],
             "flags": [flags],
-            "force_n": [[0.0, 0.0, 0.0]],
+            "force_n": [list(force_n)],
         }
-        self.contract.on_force(message, (at_ms if heard_ms is None else heard_ms) * MS)
+        return self.contract.on_force(message, (at_ms if heard_ms is None else heard_ms) * MS)
 
     def go_well(self, from_ms: int, to_ms: int) -> int:
         """A command each millisecond, each answered two later; the newest command."""
@@ -87,6 +94,30 @@ class Conversation:
             if newest > 2:
                 self.tick(now, max(newest - 2, first - 1))
         return newest
+
+
+@pytest.mark.parametrize("force_n", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.8, 0.8)])
+def test_a_force_that_is_not_finite_or_beyond_the_limit_is_not_to_be_rendered(
+    force_n: tuple[float, ...],
+) -> None:
+    said = Conversation()
+    newest = said.go_well(100, 200)
+    assert said.tick(200, newest, force_n=(0.0, 0.6, 0.6))
+    assert not said.tick(201, newest, force_n=force_n)
+    assert "tick 201: the force" in said.contract.broken[0]
+    assert said.tick(203, newest)
+    assert not said.tick(202, newest)  # from before
+
+
+def test_round_trips_are_measured_anew_and_answers_counted_on() -> None:
+    said = Conversation()
+    said.go_well(100, 200)
+    said.contract.measure_anew()
+    assert said.contract.summary()["round_trip_s"]["p50"] is None
+    said.go_well(200, 250)
+    summary = said.contract.summary()
+    assert summary["round_trip_s"]["p50"] == pytest.approx(2e-3)
+    assert summary["commands_answered"] == 98 + 49
 
 
 def test_a_client_whose_commands_are_forgotten_has_lost_its_contact() -> None:
@@ -287,6 +318,19 @@ def test_the_motors_are_left_without_a_force_when_the_server_is_killed(
     code, _, err = bridge.program.finish()
     assert code == 1
     assert "the server is gone" in err
+    assert bridge.last_force() == 0
+
+
+def test_a_bridge_lets_go_when_the_server_says_that_it_stops(
+    serve: Callable[..., Any], run_bridge_until_a_force: Callable[..., Bridge]
+) -> None:
+    served = serve()
+    bridge = run_bridge_until_a_force(served.endpoint)
+    assert served.stop() == 0
+    code, _, err = bridge.program.finish()
+    assert code == 1
+    assert "the server is stopping" in err
+    assert "contract broken" not in err
     assert bridge.last_force() == 0
 
 
