@@ -124,7 +124,8 @@ def ticks_told(path: Path, size: int) -> int:
 
 
 def is_at_rest(status: dict[str, Any]) -> bool:
-    return bool(status["at_rest_since_tick"] >= 0)
+    """For a tick at least: a status of the very tick tells of none that began at rest."""
+    return bool(0 <= status["at_rest_since_tick"] < status["ticks"])
 
 
 def assert_all_is_repeated(session: replay.Session, model: ReducedModel, heard: dict[str, Any]) -> None:
