@@ -32,7 +32,7 @@ _MAX_UNWRITTEN = 16 * 2**20  # bytes: a minute of a contact
 _END_S = 8.0  # to write the rest and end the file: on a busy machine its process is last in the queue
 _LAST_WORDS_S = 1.0  # of a process that has closed its pipe
 _PIPE_BYTES = 65536  # that a pipe takes at once
-_TOO_SLOW = "the disk can't keep up"
+_TOO_SLOW = "it can't be written as fast as it comes"
 
 
 def file_in(folder: Path, name: object) -> Path:
