@@ -51,6 +51,12 @@ def wait_for(
 # Programs
 
 
+@pytest.fixture(scope="session", autouse=True)
+def interruptible() -> None:
+    """Tests that are run in the background of a shell inherit that Ctrl-C is ignored, and so would what they start."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @dataclass
 class Program:
     """Python in a process of its own; what it prints goes to two files."""
