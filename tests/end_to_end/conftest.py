@@ -261,6 +261,17 @@ class RawClient:
     def acquire(self, *contacts: str) -> tuple[bool, dict[str, Any]]:
         return self.control("acquire", {"contacts": list(contacts)})
 
+    def record(self, file: str) -> dict[str, Any]:
+        """Begin a recording of the server's, and wait until a status has told of its first tick; the answer.
+
+        That of the recording's beginning may not: it is sent after the answer, with the tick that is the next one.
+        """
+        granted, answer = self.control("record", {"file": file})
+        assert granted, answer
+        ticks = self.next_status()["ticks"]
+        self.status_when(lambda status: status["ticks"] > ticks, "a status that tells of a recorded tick")
+        return answer
+
     def put(self, payload: bytes) -> None:
         """To the server's commands. None is dropped, and they arrive in order, but when they do nobody says."""
         self.session.put(

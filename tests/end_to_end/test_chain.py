@@ -58,7 +58,7 @@ def poke(
     place = ("--session", "chain", "--listen", endpoint)
     server = palpate("serve", "slab.npz", *place, "--recordings", ".", ready="serving slab")
     with connect(endpoint, server="chain") as client:
-        assert client.control("record", {"file": "poke.mcap"})[0]
+        client.record("poke.mcap")
         place = ("--session", "chain", "--connect", endpoint, "--silence-s", "30")
         motion = ("--contact", "right", "--amplitude-m", "0.002", "--frequency-hz", "2", "--duration-s", "2")
         code, out, err = palpate("client", *place, *motion, "--record", "poke.csv", "--json").finish()

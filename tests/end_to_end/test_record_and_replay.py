@@ -151,9 +151,7 @@ def test_a_recording_that_a_client_asks_for_has_every_tick_and_command_and_repea
 ) -> None:
     served = serve("--recordings", str(tmp_path / "new"))
     with connect(served.endpoint) as client:
-        granted, answer = client.control("record", {"file": "a.mcap"})
-        assert granted, answer
-        assert answer == {"file": "a.mcap"}
+        assert client.record("a.mcap") == {"file": "a.mcap"}
         assert client.control("record", {"file": "b.mcap"})[1]["reason"] == "busy"
         code, _, err = run_example("headless_client.py", served.endpoint, "--duration-s", "1").finish()
         assert code == 0, err
@@ -194,7 +192,7 @@ def test_whatever_a_client_has_changed_meanwhile_is_repeated_too(
 
     with connect(served.endpoint) as client:
         client.next_status()
-        assert client.control("record", {"file": "a.mcap"})[0]
+        client.record("a.mcap")
         assert client.acquire("tip")[0]
         poke(client, 300, (0, 0, 0))
         for speed in (0.05, 0.02, 0.01, 0.1, 0.03):  # sooner after one another than two usual statuses
@@ -221,7 +219,7 @@ def test_a_change_of_model_ends_what_can_be_repeated_with_either_until_the_next_
     save_model(other, tmp_path / "other.npz")
     with connect(served.endpoint) as client:
         client.next_status()
-        assert client.control("record", {"file": "a.mcap"})[0]
+        client.record("a.mcap")
         assert client.acquire("tip")[0]
         client.command({"tip": [0.0, 0.0, -1e-3]})
         client.next_status()
@@ -262,7 +260,7 @@ def test_a_server_that_ends_while_it_records_leaves_a_complete_file(
     served = serve("--recordings", str(tmp_path))
     path = tmp_path / "a.mcap"
     with connect(served.endpoint) as client:
-        assert client.control("record", {"file": "a.mcap"})[0]
+        client.record("a.mcap")
         run_example("headless_client.py", served.endpoint, "--duration-s", "60")
         client.force_when(lambda force: force["force_scale"][0] == 1.0, "the force in full")
         heard = client.next_status()
@@ -295,7 +293,7 @@ def test_a_full_disk_ends_a_recording_that_a_client_asked_for_not_the_server(
         assert len(replay.read_session(tmp_path / "full.mcap").forces) > 100
 
         # A failed one is in nobody's way, and can be ended as well as replaced.
-        assert client.control("record", {"file": "next.mcap"})[0]
+        client.record("next.mcap")
         client.status_when(lambda status: status["recording"]["messages"] > 500, "some messages")
         granted, report = client.control("record", {"file": None})
         assert granted

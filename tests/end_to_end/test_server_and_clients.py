@@ -58,7 +58,7 @@ def test_forces_through_the_wire_are_the_models_response_to_the_applied_displace
     )
     heard = tmp_path / "ticks.csv"
     with connect(served.endpoint) as client:
-        assert client.control("record", {"file": "ticks.mcap"})[0]
+        client.record("ticks.mcap")
         options = ("--duration-s", "2", "--json", "--record", str(heard))
         code, out, err = run_example("headless_client.py", served.endpoint, *options).finish()
         assert code == 0, err
