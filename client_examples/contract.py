@@ -32,7 +32,8 @@ class Contract:
         self.lost_ticks = 0
         self.flag_counts = dict.fromkeys(self.flags, 0)
         self.largest_force_n = 0.0
-        self.broken = []
+        self.broken = []  # the first times
+        self._breaks = 0
         self._last = None
         self._newest_sent_ns = 0
         self._sending_since_ns = 0  # without a pause in which our force would fade
@@ -58,7 +59,12 @@ class Contract:
         self.sent.pop(command["sequence"] - REMEMBERED, None)
 
     def on_force(self, message, arrival_ns):
-        """Whether this force may be rendered: finite, within the limit, newer than the last, and ours as far as we know."""
+        """Whether nothing about this force breaks the contract: while we hold the contact, only then may it be rendered."""
+        breaks = self._breaks
+        self._check(message, arrival_ns)
+        return self._breaks == breaks
+
+    def _check(self, message, arrival_ns):
         i = self.index
         tick, sequence, flags = message["tick"], message["sequence"][i], message["flags"][i]
         force = message["force_n"][i]
@@ -69,7 +75,7 @@ class Contract:
 
         if not all(math.isfinite(f) for f in force):
             self._break(tick, f"the force {force} is not finite")
-            return False
+            return
         magnitude = math.hypot(*force)
         self.largest_force_n = max(self.largest_force_n, magnitude)
         if magnitude > self.max_force_n + SLACK:
@@ -82,20 +88,18 @@ class Contract:
 
         if self.holding and sequence < 0 <= self.newest_answered:
             # The server keeps a holder's last command, however silent the holder is.
-            self.holding = False
-            self._break(
+            self._lose(
                 tick,
                 "we no longer hold the contact, our commands are forgotten: it was released or taken back "
                 "(after a second of silence, for instance), or the server has stopped or was started again",
             )
-            self._last = None  # another server counts its own ticks
-            return False
+            return
 
         if self._last is not None:
             last_tick, last_sequence, last_force = self._last
             if tick <= last_tick:
                 self._break(tick, f"it came after tick {last_tick}")
-                return False
+                return
             self.lost_ticks += tick - last_tick - 1
             if tick == last_tick + 1 and math.dist(force, last_force) > self.max_step_n + SLACK:
                 self._break(tick, f"the force jumped by {math.dist(force, last_force)} N in one tick")
@@ -111,8 +115,10 @@ class Contract:
             if self.holding:
                 self._check_heard(tick, sequence, message["input_age_ns"][i], flags & self.flags["STALE"])
         elif self.holding and sequence >= 0:  # while we don't hold the contact, others' are answered
-            self._break(tick, f"it answers command {sequence}, which was not sent (or not at that time)")
-        return magnitude <= self.max_force_n + SLACK
+            self._lose(
+                tick,
+                f"we no longer hold the contact: it answers command {sequence}, which was not sent (or not at that time)",
+            )
 
     def measure_anew(self):
         """Round trips that were measured until now do not count."""
@@ -136,7 +142,13 @@ class Contract:
             )
         self._unheard = unheard
 
+    def _lose(self, tick, what):
+        self.holding = False
+        self._last = None  # another server counts its own ticks, another client its own commands
+        self._break(tick, what)
+
     def _break(self, tick, what):
+        self._breaks += 1
         if len(self.broken) < 20:  # one cause can break every tick; the first ones tell
             self.broken.append(f"tick {tick}: {what}")
 

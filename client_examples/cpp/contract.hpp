@@ -116,38 +116,12 @@ class Contract {
         ++commands_;
     }
 
-    // Whether this force may be rendered: finite, within the limit, newer than the last, and ours as far as we know.
+    // Whether nothing about this force breaks the contract: while we hold the contact, only then may it be
+    // rendered.
     bool on_force(const Force& f) {
-        ++forces_;
-        const double magnitude = length(f.force_n);
-        if (!std::isfinite(f.force_n[0]) || !std::isfinite(f.force_n[1]) || !std::isfinite(f.force_n[2])) {
-            broke(f.tick, "the force [%g, %g, %g] is not finite", f.force_n[0], f.force_n[1], f.force_n[2]);
-            return false;
-        }
-        largest_force_n_ = std::max(largest_force_n_, magnitude);
-        if (magnitude > max_force_n_ + slack) {
-            broke(f.tick, "the force is %g N, the limit %g N", magnitude, max_force_n_);
-        }
-        if ((f.flags & stale_) && magnitude > 0) {
-            broke(f.tick, "the input is stale and the force still %g N", magnitude);
-        }
-        const auto age_ns = static_cast<double>(f.input_age_ns);
-        if (!(f.flags & (decaying_ | stale_)) && age_ns > hold_ns_) {
-            broke(f.tick, "the input is %g ms old and no flag says so", age_ns / 1e6);
-        }
-        if (holding_ && f.sequence < 0 && newest_answered_ >= 0) {
-            // The server keeps a holder's last command, however silent the holder is.
-            holding_ = false;
-            broke(f.tick,
-                  "we no longer hold the contact, our commands are forgotten: it was released or taken back "
-                  "(after a second of silence, for instance), or the server has stopped or was started again");
-            last_.reset();  // another server counts its own ticks
-            return false;
-        }
-        if (!follows(f)) return false;
-        last_ = f;
-        check_answer(f);
-        return magnitude <= max_force_n_ + slack;
+        const std::int64_t breaks = breaks_;
+        check(f);
+        return breaks_ == breaks;
     }
 
     // What was measured until now does not count.
@@ -176,6 +150,37 @@ class Contract {
     };
 
     static std::size_t index(std::int64_t sequence) { return static_cast<std::size_t>(sequence % remembered); }
+
+    void check(const Force& f) {
+        ++forces_;
+        const double magnitude = length(f.force_n);
+        if (!std::isfinite(f.force_n[0]) || !std::isfinite(f.force_n[1]) || !std::isfinite(f.force_n[2])) {
+            broke(f.tick, "the force [%g, %g, %g] is not finite", f.force_n[0], f.force_n[1], f.force_n[2]);
+            return;
+        }
+        largest_force_n_ = std::max(largest_force_n_, magnitude);
+        if (magnitude > max_force_n_ + slack) {
+            broke(f.tick, "the force is %g N, the limit %g N", magnitude, max_force_n_);
+        }
+        if ((f.flags & stale_) && magnitude > 0) {
+            broke(f.tick, "the input is stale and the force still %g N", magnitude);
+        }
+        const auto age_ns = static_cast<double>(f.input_age_ns);
+        if (!(f.flags & (decaying_ | stale_)) && age_ns > hold_ns_) {
+            broke(f.tick, "the input is %g ms old and no flag says so", age_ns / 1e6);
+        }
+        if (holding_ && f.sequence < 0 && newest_answered_ >= 0) {
+            // The server keeps a holder's last command, however silent the holder is.
+            lose();
+            broke(f.tick,
+                  "we no longer hold the contact, our commands are forgotten: it was released or taken back "
+                  "(after a second of silence, for instance), or the server has stopped or was started again");
+            return;
+        }
+        if (!follows(f)) return;
+        last_ = f;
+        check_answer(f);
+    }
 
     bool follows(const Force& f) {
         if (!last_) return true;
@@ -206,7 +211,9 @@ class Contract {
             }
             if (holding_) check_heard(f, sent.client_time_ns);
         } else if (holding_) {  // while we don't hold the contact, others' are answered
-            broke(f.tick, "it answers command %lld, which was not sent (or not at that time)",
+            lose();
+            broke(f.tick,
+                  "we no longer hold the contact: it answers command %lld, which was not sent (or not at that time)",
                   static_cast<long long>(f.sequence));
         }
     }
@@ -228,7 +235,13 @@ class Contract {
         unheard_ = unheard;
     }
 
+    void lose() {
+        holding_ = false;
+        last_.reset();  // another server counts its own ticks, another client its own commands
+    }
+
     __attribute__((format(printf, 3, 4))) void broke(std::int64_t tick, const char* format, ...) {
+        ++breaks_;
         if (broken_.size() >= told) return;
         std::array<char, 256> what{};
         std::va_list values;
@@ -242,7 +255,7 @@ class Contract {
     double max_force_n_, max_step_n_, hold_ns_, fade_ns_;
     bool holding_ = false, unheard_ = false;
     std::vector<Sent> sent_ = std::vector<Sent>(remembered);
-    std::int64_t commands_ = 0, answered_ = 0, forces_ = 0, lost_ticks_ = 0, newest_answered_ = -1;
+    std::int64_t commands_ = 0, answered_ = 0, forces_ = 0, lost_ticks_ = 0, newest_answered_ = -1, breaks_ = 0;
     std::int64_t newest_sent_ns_ = 0,
                  sending_since_ns_ = 0;  // since: without a pause in which our force would fade
     double largest_force_n_ = 0.0;

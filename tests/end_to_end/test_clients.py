@@ -20,6 +20,7 @@ from palpate_server.safety import DECAY_NS, HOLD_NS, Flags
 
 EXAMPLES = Path(__file__).parents[2] / "client_examples"
 MS = 1_000_000
+LIMITS = {"max_force_n": 1.0, "max_force_rate_n_per_s": 1000.0}
 FADE_MS = (HOLD_NS + DECAY_NS) // MS
 
 # The bridge as it is, with a driver whose motors write down where they are and each force that they are given.
@@ -45,17 +46,16 @@ class Conversation:
     """A contract of a client that holds its contact, fed with commands and ticks of a server one millisecond away."""
 
     def __init__(self) -> None:
-        limits = {"max_force_n": 1.0, "max_force_rate_n_per_s": 1000.0}
         description = {
             "contacts": [{"name": "tip"}],
             "flags": {flag.name: flag.value for flag in Flags},
-            "limits": limits,
+            "limits": LIMITS,
             "period_s": 1e-3,
             "hold_s": HOLD_NS * 1e-9,
             "decay_s": DECAY_NS * 1e-9,
         }
         self.contract = Contract(description, "tip")
-        self.contract.agree({"limits": limits})
+        self.contract.agree({"limits": LIMITS})
         self.sent_ms: dict[int, int] = {}
 
     def send(self, at_ms: int) -> int:
@@ -107,6 +107,44 @@ def test_a_force_that_is_not_finite_or_beyond_the_limit_is_not_to_be_rendered(
     assert "tick 201: the force" in said.contract.broken[0]
     assert said.tick(203, newest)
     assert not said.tick(202, newest)  # from before
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said_of_it"),
+    [
+        ({"force_n": [[1.01, 0.0, 0.0]]}, "the limit 1.0 N"),
+        ({"force_n": [[math.nan, 0.0, 0.0]]}, "is not finite"),
+        ({"force_n": [[-0.9, 0.0, 0.0]]}, "jumped by 1.8"),
+        ({"flags": [int(Flags.STALE)]}, "the input is stale"),
+        ({"input_age_ns": [HOLD_NS + 2 * MS]}, "no flag says so"),
+        ({"tick": 199}, "it came after tick 200"),
+        ({"sequence": [90], "client_time_ns": [189 * MS]}, "the tick before answered 98"),
+        ({"sequence": [1000]}, "we no longer hold the contact: it answers command 1000"),
+        ({"client_time_ns": [77]}, "we no longer hold the contact: it answers command 98"),
+        ({"sequence": [-1]}, "we no longer hold the contact, our commands are forgotten"),
+    ],
+)
+def test_a_force_that_breaks_the_contract_in_any_way_is_not_to_be_rendered_but_the_next_good_one_is(
+    wrong: dict[str, Any], said_of_it: str
+) -> None:
+    said = Conversation()
+    said.go_well(100, 200)
+    good = {
+        "tick": 200,
+        "sequence": [98],
+        "client_time_ns": [said.sent_ms[98] * MS],
+        "input_age_ns": [2 * MS],
+        "flags": [0],
+        "force_n": [[0.9, 0.0, 0.0]],
+    }
+    assert said.contract.on_force(good, 200 * MS)
+    assert not said.contract.on_force(good | {"tick": 201} | wrong, 201 * MS)
+    (broken,) = said.contract.broken
+    assert said_of_it in broken
+    assert said.contract.holding is ("no longer" not in broken)
+    said.contract.agree({"limits": LIMITS})
+    assert said.contract.on_force(good | {"tick": 202, "force_n": [[0.05, 0.0, 0.0]]}, 202 * MS)
+    assert len(said.contract.broken) == 1
 
 
 def test_round_trips_are_measured_anew_and_answers_counted_on() -> None:

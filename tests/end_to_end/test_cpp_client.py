@@ -214,8 +214,9 @@ def troubled_conversation(seed: int) -> list[tuple[Any, ...]]:
     return said
 
 
-def in_python(said: list[tuple[Any, ...]]) -> tuple[list[float], list[str]]:
+def in_python(said: list[tuple[Any, ...]]) -> tuple[list[float], str, list[str]]:
     contract = Contract(PROMISE, "tip")
+    may_be_rendered = ""
     for word, *values in said:
         if word == "agree":
             contract.agree({"limits": PROMISE["limits"]})
@@ -233,7 +234,7 @@ def in_python(said: list[tuple[Any, ...]]) -> tuple[list[float], list[str]]:
                 "flags": [flags],
                 "force_n": [[force, 0.0, 0.0]],
             }
-            contract.on_force(message, arrival_ns)
+            may_be_rendered += "1" if contract.on_force(message, arrival_ns) else "0"
     summary = contract.summary()
     trips = summary["round_trip_s"]
     counts = [
@@ -244,7 +245,7 @@ def in_python(said: list[tuple[Any, ...]]) -> tuple[list[float], list[str]]:
         summary["commands_answered"],
         summary["largest_force_n"],
     ]
-    return [*counts, trips["p50"], trips["p99"], trips["max"]], summary["contract_broken"]
+    return [*counts, trips["p50"], trips["p99"], trips["max"]], may_be_rendered, summary["contract_broken"]
 
 
 def without_numbers(lines: list[str]) -> list[str]:
@@ -259,12 +260,13 @@ def test_the_contract_says_the_same_in_both_languages(listen: Callable[..., str]
     heard = set()
     for seed in SEEDS:
         said = troubled_conversation(seed)
-        numbers, broken = in_python(said)
-        first, _, *lines = listen(
+        numbers, may_be_rendered, broken = in_python(said)
+        first, rendered, *lines = listen(
             "contract", "\n".join(" ".join(map(str, line)) for line in said)
         ).splitlines()
         *counts, p50, p99, longest = map(float, first.split())
         assert counts == [float(n) for n in numbers[:6]], seed
+        assert rendered == may_be_rendered, seed
         assert without_numbers(lines) == without_numbers(broken), seed
         assert longest == pytest.approx(numbers[8], abs=1e-12)
         for ours, exact in ((p50, numbers[6]), (p99, numbers[7])):
