@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -15,27 +15,19 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Sums may be reordered and fused: that is what vectorises a dot product.
-_FAST_MATH = {"reassoc", "contract", "nsz"}
-
 
 def compiled(function: Function) -> Function:
-    """Compile `function`, every operation as written; Python calls it with the GIL held, so use it for microseconds."""
+    """Compile `function`, every operation as written; Python calls it with the GIL held, so use it for microseconds.
+
+    Nothing is compiled with `fastmath`: how sums are then reordered differs between two compilations of the same code, and a
+    replay would not be exact. And a test for NaN on such sums is optimised away.
+    """
     return _compile(function, nogil=False)
 
 
 def compiled_without_gil(function: Function) -> Function:
     """Compile `function`; it releases the GIL for as long as it runs."""
     return _compile(function, nogil=True)
-
-
-def compiled_fast(function: Function) -> Function:
-    """Compile `function` with sums reordered and fused, for loops over a model's order alone.
-
-    Elsewhere how they are reordered differs between two compilations of the same code into different callers, by a bit in
-    one tick of some thousands: a replay would not be exact. And a test for NaN on such sums is optimised away.
-    """
-    return _compile(function, nogil=False, fast_math=_FAST_MATH)
 
 
 class _Cache(FunctionCache):
@@ -63,8 +55,8 @@ def _package_digest() -> str:
     return digest.hexdigest()
 
 
-def _compile(function: Function, *, nogil: bool, fast_math: Collection[str] = ()) -> Function:
-    dispatcher: Any = njit(nogil=nogil, fastmath=set(fast_math))(function)
+def _compile(function: Function, *, nogil: bool) -> Function:
+    dispatcher: Any = njit(nogil=nogil)(function)
     try:
         dispatcher._cache = _Cache(function)
     except (

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_server.compiled import compiled_fast
+from palpate_server.compiled import compiled
+from palpate_server.dot import dot
 
 Floats = NDArray[np.float64]
 
@@ -29,22 +30,17 @@ def aligned(values: Floats) -> Floats:
     return copy
 
 
-@compiled_fast
+@compiled
 def output(c: Floats, d: Floats, state: Floats, displacement: Floats, force: Floats) -> None:
     """Write F = C xi + D u into `force`.
 
     c (n_outputs, order), d (n_outputs, n_inputs), state (order,), displacement (n_inputs,) m, force (n_outputs,) N
     """
     for row in range(c.shape[0]):
-        total = 0.0
-        for i in range(c.shape[1]):
-            total += c[row, i] * state[i]
-        for j in range(d.shape[1]):
-            total += d[row, j] * displacement[j]
-        force[row] = total
+        force[row] = dot(c[row], state) + dot(d[row], displacement)
 
 
-@compiled_fast
+@compiled
 def update(
     diagonal: Floats, cross: Floats, b_transposed: Floats, state: Floats, displacement: Floats
 ) -> None:

@@ -6,9 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numba import njit
 
 from palpate.model import ReducedModel
-from palpate_server import kernel
+from palpate_server import kernel, layout, loop
+from palpate_server.dot import LANES, dot
+from palpate_server.image import make_image
+from palpate_server.safety import Limits
+from palpate_server.sample_model import spring_mass_model
 
 
 @pytest.mark.parametrize(("n_contacts", "n_modes"), [(1, 1), (1, 60), (10, 60)])
@@ -52,3 +57,63 @@ def test_an_aligned_copy_begins_on_a_cache_line_and_holds_the_same_numbers(shape
         assert copy.flags.c_contiguous
         assert copy.flags.writeable
         assert not np.shares_memory(copy, original)
+
+
+def summed_in_the_stated_order(first: np.ndarray, second: np.ndarray) -> float:
+    """What `dot` promises, with one rounded operation of numpy's at a time."""
+    products = first * second
+    whole = len(products) // LANES * LANES
+    lanes = np.zeros(LANES)
+    for i in range(0, whole, LANES):
+        lanes = lanes + products[i : i + LANES]
+    while len(lanes) > 1:
+        lanes = lanes[: len(lanes) // 2] + lanes[len(lanes) // 2 :]
+    total = lanes[0]
+    for product in products[whole:]:
+        total = total + product
+    return float(total)
+
+
+@njit
+def compiled_dot(first: np.ndarray, second: np.ndarray) -> float:
+    return dot(first, second)
+
+
+def test_a_dot_product_is_summed_in_the_stated_order() -> None:
+    random = np.random.default_rng(3)
+    differs_from_another_order = 0
+    for size in [*range(70), 200, 201, 607]:
+        first, second = random.normal(size=(2, size))
+        result = compiled_dot(first, second)
+        assert result == summed_in_the_stated_order(first, second)
+        differs_from_another_order += result != sum(first * second)
+    assert differs_from_another_order > 20
+
+
+def test_every_force_is_rounded_the_same_wherever_its_code_was_compiled() -> None:
+    """Ticks, in which the kernel is compiled into other code, against the same operations one at a time."""
+    model = spring_mass_model(2, 50)
+    system = model.discrete
+    memory = layout.make_memory(system, model.period_s, [Limits(1e6, 1e12, 1e6, 1e6, 0.0)] * 2, 1 / 30)
+    image = make_image(memory)
+    random = np.random.default_rng(4)
+    state = np.zeros(system.order)
+    for tick in range(500):
+        now = (tick + 1) * 1_000_000
+        displacement = 1e-3 * random.normal(size=6)
+        for contact in range(2):
+            target = tuple(displacement[3 * contact : 3 * contact + 3].tolist())
+            loop.write_command(memory.commands, contact, tick, 0, now, -1, 0, target, (0.0, 0.0, 0.0))
+        loop.repeat_tick(image, now)
+        force = [
+            summed_in_the_stated_order(c, state) + summed_in_the_stated_order(d, displacement)
+            for c, d in zip(system.c, system.d, strict=True)
+        ]
+        np.testing.assert_array_equal(memory.force.ravel(), force)
+        partner = state.reshape(-1, 2)[:, ::-1].ravel()
+        following = system.diagonal * state + system.cross * partner
+        for column, u in zip(system.b.T, displacement, strict=True):
+            following = following + column * u
+        state = following
+    np.testing.assert_array_equal(memory.model.state, state)
+    assert np.all(memory.force != 0.0)

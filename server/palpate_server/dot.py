@@ -1,0 +1,86 @@
+"""A dot product for compiled code that is fast and always rounds the same: with vectors, but the sums in one stated order.
+
+A compiler that may reorder sums vectorises them too, but in an order of its own, which is another in another caller, after
+another start or on another processor. A replay that compares bit for bit can't live with that.
+"""
+
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, call-arg, arg-type"
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import cast
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+LANES = 16  # numbers at a time: the vectors of every processor divide it
+
+_DOUBLE, _INT32 = ir.DoubleType(), ir.IntType(32)
+
+
+def _is_vector(array) -> bool:
+    return (
+        isinstance(array, types.Array)
+        and array.ndim == 1
+        and array.layout == "C"
+        and array.dtype == types.float64
+    )
+
+
+@intrinsic
+def _dot(typing_context, first, second):
+    if not (_is_vector(first) and _is_vector(second)):
+        return None
+
+    def codegen(context, builder, signature, args):
+        arrays = [
+            context.make_array(t)(context, builder, a) for t, a in zip(signature.args, args, strict=True)
+        ]
+        size = cgutils.unpack_tuple(builder, arrays[0].shape)[0]
+        whole = builder.sdiv(size, size.type(LANES))
+
+        lanes_type = ir.VectorType(_DOUBLE, LANES)
+        lanes = cgutils.alloca_once_value(builder, ir.Constant(lanes_type, [0.0] * LANES))
+        with cgutils.for_range(builder, whole) as loop:
+            place = builder.mul(loop.index, size.type(LANES))
+            x, y = (
+                builder.load(builder.bitcast(builder.gep(a.data, [place]), lanes_type.as_pointer()), align=8)
+                for a in arrays
+            )
+            builder.store(builder.fadd(builder.load(lanes), builder.fmul(x, y)), lanes)
+
+        total = builder.load(lanes)
+        width = LANES
+        while width > 1:
+            width //= 2
+            nothing = ir.Constant(total.type, ir.Undefined)
+            low, high = (
+                ir.Constant(ir.VectorType(_INT32, width), list(range(begin, begin + width)))
+                for begin in (0, width)
+            )
+            total = builder.fadd(
+                builder.shuffle_vector(total, nothing, low), builder.shuffle_vector(total, nothing, high)
+            )
+
+        result = cgutils.alloca_once_value(builder, builder.extract_element(total, _INT32(0)))
+        rest = builder.mul(whole, size.type(LANES))
+        with cgutils.for_range_slice(builder, rest, size, size.type(1)) as (place, _):
+            x, y = (builder.load(builder.gep(a.data, [place])) for a in arrays)
+            builder.store(builder.fadd(builder.load(result), builder.fmul(x, y)), result)
+        return builder.load(result)
+
+    return types.float64(first, second), codegen
+
+
+dot = cast(Callable[[Floats, Floats], float], _dot)
+"""sum_i first[i] second[i] of two vectors (n,), each in one piece; for compiled code alone.
+
+The order: LANES sums, of every LANES-th product each; their upper half added to the lower one until one is left; then the
+last n % LANES products one by one. Every product and every sum is rounded to float64.
+"""
