@@ -140,6 +140,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 stream = options.out.open("xb")
             except FileExistsError:
                 raise ValueError(f"{options.out} exists: expected the name of a new file") from None
+            except OSError as error:
+                raise ValueError(f"{options.out}: {error.strerror}") from error
             end_s = time.monotonic() + (options.duration_s or math.inf)
             try:
                 recording = Recording(stream)

@@ -121,7 +121,9 @@ def read_session(path: Path) -> Session:
                     session.statuses.append(message)
                 elif kind == "command":
                     _add_command(session, wire.last_chunk(key), message)
-    except (McapError, OSError) as error:
+    except OSError as error:
+        raise ReplayError(f"{path}: {error.strerror}") from error
+    except McapError as error:
         raise ReplayError(f"{path}: not an MCAP file that can be read ({error})") from error
     except (KeyError, TypeError, json.JSONDecodeError) as error:
         raise ReplayError(

@@ -296,8 +296,9 @@ class Server:
     def _queue_query(self, answer: Callable[[zenoh.Query], None]) -> Callable[[zenoh.Query], None]:
         def take(query: zenoh.Query) -> None:
             try:
-                if query.payload is not None:  # a large one is not left waiting: many would take much room
-                    wire.check_size(len(query.payload), wire.MAX_REQUEST_BYTES)
+                # A large one is not left waiting: many would take much room.
+                parts = (query.payload, query.attachment)
+                wire.check_size(sum(len(part) for part in parts if part is not None), wire.MAX_REQUEST_BYTES)
             except wire.MalformedMessage as error:
                 with query:
                     _refuse(query, error.reason, str(error))

@@ -240,6 +240,8 @@ def test_a_request_that_is_too_large_is_refused_before_it_is_read(
         assert not granted
         assert refusal["reason"] == "too_large"
         assert "expected at most 16384" in refusal["message"]
+        (reply,) = client.session.get("palpate/test/describe", attachment=bytes(size), timeout=60.0)
+        assert msgpack.unpackb(reply.err.payload.to_bytes())["reason"] == "too_large"
         assert client.acquire("tip")[0]
 
 

@@ -709,17 +709,19 @@ def test_no_tick_comes_between_two_contacts_of_a_command(
     writer.start()
     seen: set[int] = set()
     give_up = time.monotonic() + 60
-    while len(seen) < 1000:
-        assert time.monotonic() < give_up
-        _run_ticks(image, 1000)
-        rows = (loop.records_written(memory.shared) - 1 - np.arange(1000)) % layout.RECORDS
-        sequences = memory.record_inputs[rows, :, layout.SEQUENCE]
-        np.testing.assert_array_equal(sequences[:, 0], sequences[:, 1])
-        np.testing.assert_array_equal(memory.newest_integers[0], memory.newest_integers[1])
-        np.testing.assert_array_equal(memory.target[0], memory.target[1])
-        seen |= set(sequences[:, 0].tolist())
-    enough.set()
-    writer.join()
+    try:
+        while len(seen) < 1000:
+            assert time.monotonic() < give_up
+            _run_ticks(image, 1000)
+            rows = (loop.records_written(memory.shared) - 1 - np.arange(1000)) % layout.RECORDS
+            sequences = memory.record_inputs[rows, :, layout.SEQUENCE]
+            np.testing.assert_array_equal(sequences[:, 0], sequences[:, 1])
+            np.testing.assert_array_equal(memory.newest_integers[0], memory.newest_integers[1])
+            np.testing.assert_array_equal(memory.target[0], memory.target[1])
+            seen |= set(sequences[:, 0].tolist())
+    finally:
+        enough.set()
+        writer.join()
 
 
 def test_a_command_that_is_staged_waits_for_the_rest_and_for_a_lease_that_still_holds(
