@@ -28,6 +28,7 @@ class Query:
     def __init__(self, client: str, action: str, request: object) -> None:
         self.key_expr = f"palpate/test/control/{client}/{action}"
         self.payload = self
+        self.attachment = None
         self._request = msgpack.packb(request)
         self.refusals: list[dict[str, Any]] = []
 
