@@ -23,7 +23,7 @@ class ServerGone(Exception):
 
 
 class Refused(Exception):
-    """The server said no; the message is its own."""
+    """The server said no, and the message is its own; or we have to, and asking again would not help."""
 
 
 class Connection:
@@ -39,10 +39,15 @@ class Connection:
         self.gone = threading.Event()
         self.sequence = 0
         try:
-            self.zenoh = zenoh.open(_configuration(endpoint, zenoh_config))
+            configuration = _configuration(endpoint, zenoh_config)
         except zenoh.ZError as error:
-            cause = str(error).partition(" at /")[0]  # what follows is a place in Zenoh's own source
-            raise ServerGone(f"nothing answers at {self.place}: {cause}") from error
+            if zenoh_config:
+                raise Refused(f"{zenoh_config}: {_cause(error)}") from error
+            raise Refused(f"{endpoint!r} is no endpoint, such as tcp/127.0.0.1:7447") from error
+        try:
+            self.zenoh = zenoh.open(configuration)
+        except zenoh.ZError as error:
+            raise ServerGone(f"nothing answers at {self.place}: {_cause(error)}") from error
         try:
             self._join()
         except BaseException:
@@ -149,6 +154,10 @@ class Connection:
             handle(msgpack.unpackb(sample.payload.to_bytes()))
 
         self._statuses = self.zenoh.declare_subscriber(f"{self.prefix}/status", receive)
+
+
+def _cause(error):
+    return str(error).partition(" at /")[0]  # what follows is a place in Zenoh's own source
 
 
 def _configuration(endpoint, zenoh_config):

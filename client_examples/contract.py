@@ -59,7 +59,7 @@ class Contract:
         self.sent.pop(command["sequence"] - REMEMBERED, None)
 
     def on_force(self, message, arrival_ns):
-        """Whether nothing about this force breaks the contract: while we hold the contact, only then may it be rendered."""
+        """Whether nothing about it breaks the contract: only then, and while we hold the contact, may it be rendered."""
         breaks = self._breaks
         self._check(message, arrival_ns)
         return self._breaks == breaks
@@ -117,7 +117,8 @@ class Contract:
         elif self.holding and sequence >= 0:  # while we don't hold the contact, others' are answered
             self._lose(
                 tick,
-                f"we no longer hold the contact: it answers command {sequence}, which was not sent (or not at that time)",
+                f"we no longer hold the contact: it answers command {sequence}, which was not sent "
+                "(or not at that time)",
             )
 
     def measure_anew(self):

@@ -4,7 +4,7 @@ To use a real one, write a class like SimulatedDevice around its driver: `positi
 
 Whatever ends it, the device is left without a force. Exit code 0: all well. 1: the contract was broken, the contact was
 lost or the server went away; to go on, start it again: whoever holds the device then begins at rest. 2: it could not start.
-130: Ctrl-C or SIGTERM.
+130: Ctrl-C, SIGTERM, SIGQUIT or SIGHUP.
 """
 
 import argparse
@@ -20,9 +20,7 @@ from contract import Contract
 
 SETTLE_S = 0.5  # the server's deadlines move to where our commands come, in a quarter of a second
 MEASURE_S = 1.0  # of round trips: a thousand
-FORCE_HOLD_S = (
-    0.02  # that a force is rendered for without a newer one: as long as the server holds a silent input
-)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)
 
 
 class SimulatedDevice:
@@ -50,7 +48,10 @@ class SimulatedDevice:
 
 def main():
     options = parse_options()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # like Ctrl-C
+    for number in SIGNALS:
+        # Under nohup a hang-up goes on being ignored.
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, interrupt)
     zenoh.try_init_log_from_env()  # silent unless RUST_LOG says otherwise
     try:
         with Connection(options.connect, options.session, options.zenoh_config, options.name) as connection:
@@ -62,11 +63,19 @@ def main():
         return 130
 
 
+def interrupt(*_):
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)  # a second one must not come in the way of letting go
+    raise KeyboardInterrupt
+
+
 def run(connection, options):
     contact = connection.description["contacts"][0]
     contract = Contract(connection.description, contact["name"])
     inwards = [-n for n in contact["normal"]]
-    newest = {"force": 0.0, "tick": None, "heard": time.monotonic()}
+    # Of one message, in one piece, since another thread writes it: the force along the line of motion, its tick, and when
+    # it was heard.
+    newest = 0.0, None, time.monotonic()
     stopping = threading.Event()
 
     def on_status(status):
@@ -74,13 +83,13 @@ def run(connection, options):
             stopping.set()
 
     def on_force(message, arrival_ns):
+        nonlocal newest
         if not contract.on_force(message, arrival_ns):
             return  # what may not be rendered is as good as silence
-        # The message holds what the tip does to the tissue; the hand feels the opposite. Along the line of motion:
+        # The message holds what the tip does to the tissue; the hand feels the opposite.
         force = message["force_n"][contract.index]
-        newest["force"] = -sum(f * n for f, n in zip(force, inwards, strict=True))
-        newest["tick"] = message["tick"]
-        newest["heard"] = time.monotonic()
+        along = -sum(f * n for f, n in zip(force, inwards, strict=True))
+        newest = along, message["tick"], time.monotonic()
 
     connection.on_force(on_force)
     connection.on_status(on_status)
@@ -102,18 +111,20 @@ def run(connection, options):
     for warning in terms["warnings"]:
         print(f"warning: {warning}", file=sys.stderr)
     period = connection.description["period_s"]
+    hold_s = connection.description["hold_s"]  # a force is held as long as the server holds a silent input
     deepest = 0.0
     trouble = None
-    let_go = False
+    let_go = True  # a hand that begins in the tissue has to leave it first
     rendered = {}  # nothing is told before the first force is rendered
     try:
         for i in steps(options.duration_s, period):
             # Never keep rendering what the server said long ago.
-            silence_s = time.monotonic() - newest["heard"]
-            if connection.gone.is_set():
-                trouble = "the server is gone, or the link to it: its liveliness token was taken back"
-            elif stopping.is_set():
+            force, tick, heard = newest
+            silence_s = time.monotonic() - heard
+            if stopping.is_set():  # it says so before it goes
                 trouble = "the server is stopping"
+            elif connection.gone.is_set():
+                trouble = "the server is gone, or the link to it: its liveliness token was taken back"
             elif not contract.holding:
                 trouble = "the contact is no longer ours"
             elif silence_s > options.silence_s:
@@ -121,7 +132,7 @@ def run(connection, options):
             if trouble:
                 break
             # A force that comes back in the tissue would jump: once let go, the tip stays out until the hand is out.
-            let_go = silence_s > FORCE_HOLD_S or (let_go and device.position_m > 0)
+            let_go = silence_s > hold_s or (let_go and device.position_m > 0)
             # The tip is outside the tissue until its position is inside it; then it pushes, and nothing pulls it in.
             depth = 0.0 if let_go else max(device.position_m, 0.0)
             # The velocity lets the server carry the motion on when a command is late; the tick tells it which of its
@@ -134,8 +145,8 @@ def run(connection, options):
             )
             contract.on_sent(command)  # before it is sent: the answer may come before `send` returns
             connection.send(command)
-            device.render(newest["force"] if depth > 0 else 0.0)
-            rendered = {} if newest["tick"] is None else {"rendered_tick": newest["tick"]}
+            device.render(force if depth > 0 else 0.0)
+            rendered = {} if tick is None else {"rendered_tick": tick}
             device.move(options.reach_m * (1 - math.cos(2 * math.pi * i * period)) / 2, period)
             deepest = max(deepest, device.position_m)
     finally:

@@ -26,7 +26,7 @@ struct ServerGone : std::runtime_error {
     using std::runtime_error::runtime_error;
 };
 
-// The server said no; the message is its own.
+// The server said no, and the message is its own; or we have to, and asking again would not help.
 struct Refused : std::runtime_error {
     using std::runtime_error::runtime_error;
 };
@@ -152,8 +152,9 @@ class Connection {
     static constexpr std::int64_t patience_ns = 3'000'000'000;
 
     static zenoh::Session open(const std::string& endpoint, const std::string& zenoh_config) {
+        auto config = configuration(endpoint, zenoh_config);
         try {
-            return zenoh::Session::open(configuration(endpoint, zenoh_config));
+            return zenoh::Session::open(std::move(config));
         } catch (const zenoh::ZException& error) {
             throw ServerGone("nothing answers at " + place(endpoint, zenoh_config) + ": " + error.what());
         }
@@ -163,10 +164,18 @@ class Connection {
         return zenoh_config.empty() ? endpoint : zenoh_config;
     }
 
+    static zenoh::Config configuration(const std::string& endpoint, const std::string& zenoh_config) {
+        try {
+            return zenoh_config.empty() ? through(endpoint) : zenoh::Config::from_file(zenoh_config);
+        } catch (const zenoh::ZException& error) {
+            throw Refused(zenoh_config.empty() ? "'" + endpoint + "' is no endpoint, such as tcp/127.0.0.1:7447"
+                                               : error.what());
+        }
+    }
+
     // Everything goes through the one endpoint, be it the server's or a router's; nothing is listened on or
     // looked for.
-    static zenoh::Config configuration(const std::string& endpoint, const std::string& zenoh_config) {
-        if (!zenoh_config.empty()) return zenoh::Config::from_file(zenoh_config);
+    static zenoh::Config through(const std::string& endpoint) {
         auto config = zenoh::Config::create_default();
         config.insert_json5("mode", R"("client")");
         config.insert_json5("connect/endpoints", R"([")" + endpoint + R"("])");

@@ -42,14 +42,16 @@ struct Promise {
 // first.
 class Gate {
  public:
-    static constexpr std::int64_t force_hold_ns = 20'000'000;  // as long as the server holds a silent input
+    // A force is held as long without a newer one as the server holds a silent input.
+    explicit Gate(std::int64_t hold_ns) : hold_ns_(hold_ns) {}
 
     bool open(std::int64_t silence_ns, bool inside) {
-        closed_ = silence_ns > force_hold_ns || (closed_ && inside);
+        closed_ = silence_ns > hold_ns_ || (closed_ && inside);
         return inside && !closed_;
     }
 
  private:
+    std::int64_t hold_ns_;
     bool closed_ = true;
 };
 

@@ -1,7 +1,8 @@
 // Close the loop with a haptic device: read its position, send it, render the force.
 //
 // Whatever ends it, the device is left without a force. Exit code 0: all well. 1: the contract was broken,
-// the contact was lost or the server went away. 2: it could not start. 130: Ctrl-C or SIGTERM.
+// the contact was lost, the server went away or the device failed. 2: it could not start. 130: Ctrl-C,
+// SIGTERM, SIGQUIT or SIGHUP.
 
 #include DEVICE_HEADER
 
@@ -32,6 +33,7 @@ namespace {
 constexpr int loop_priority = 60, zenoh_priority = 55;
 // The server's deadlines move to where our commands come, in a quarter of a second; then round trips are measured.
 constexpr double settle_s = 0.5, measure_s = 1.0;
+constexpr double longest_s = 1e9;  // that an option may be: thirty years, which are still countable in ns
 
 struct Options {
     std::string connect = "tcp/127.0.0.1:7447", zenoh_config, session = "main", name, contact, device = "generic";
@@ -39,21 +41,21 @@ struct Options {
 };
 
 // Both lock-free, so that a signal's handler may use them.
-std::atomic<bool> driving{false}, interrupted{false};
+std::atomic<bool> device_opened{false}, interrupted{false};
 
 void on_signal(int) {
-    if (!driving) _exit(130);  // nothing is rendered; our contact is free as soon as our token is gone
+    if (!device_opened) _exit(130);  // nothing is rendered; our contact is free as soon as our token is gone
     interrupted = true;
 }
+
+// Thrown where we wait, so that the device is closed.
+struct Interrupted {};
 
 // While it lives forces may be rendered; at its end, however that comes, none is.
 class Driving {
  public:
-    explicit Driving(Device& device) : device_(device) { driving = true; }
-    ~Driving() {
-        device_.render({});
-        driving = false;
-    }
+    explicit Driving(Device& device) : device_(device) {}
+    ~Driving() { device_.render({}); }
     Driving(const Driving&) = delete;
     Driving& operator=(const Driving&) = delete;
 
@@ -70,7 +72,8 @@ class Bridge {
           inwards_(-1.0 * contact_.normal),
           options_(options),
           period_ns_(std::llround(connection.description().promise.period_s * 1e9)),
-          contract_(connection.description().promise) {
+          contract_(connection.description().promise),
+          gate_(std::llround(connection.description().promise.hold_s * 1e9)) {
         connection.hear(contact);
     }
 
@@ -175,6 +178,7 @@ class Bridge {
     void rest(double seconds) {
         const std::int64_t end_ns = now_ns() + std::llround(seconds * 1e9);
         while (now_ns() < end_ns && !connection_.gone()) {
+            if (interrupted) throw Interrupted{};
             take_forces();
             send(Command{});
             deadlines_.wait();
@@ -196,8 +200,8 @@ class Bridge {
     }
 
     std::optional<std::string> lost() const {
+        if (connection_.stopping()) return "the server is stopping";  // it says so before it goes
         if (connection_.gone()) return "the server is gone, or the link to it: its liveliness token was taken back";
-        if (connection_.stopping()) return "the server is stopping";
         if (connection_.unreadable()) return "the server sent what can't be read";
         if (!contract_.holding()) return "the contact is no longer ours";
         if (static_cast<double>(now_ns() - newest_.arrival_ns) > options_.silence_s * 1e9) {
@@ -242,12 +246,14 @@ int run(const Options& options) {
     // When something is lost all is agreed anew, if that is wanted: nothing of the old agreement holds.
     for (;;) {
         try {
+            if (interrupted) throw Interrupted{};
             raise_priority(zenoh_priority);  // Zenoh's threads inherit it
             Connection connection(options.connect, options.zenoh_config, options.session, options.name);
             raise_priority(loop_priority);
             const auto& description = connection.description();
             const std::size_t contact = find_contact(description, options.contact);
             if (!device) {
+                device_opened = true;
                 device.emplace(-1.0 * description.contacts[contact].normal);
                 device->render({});
                 model = description.model;
@@ -266,7 +272,9 @@ int run(const Options& options) {
             if (!trouble) return well ? 0 : 1;
             if (options.wait_s == 0) return 1;
             give_up_ns = now_ns() + std::llround(options.wait_s * 1e9);
-        } catch (const std::runtime_error& error) {
+        } catch (const Interrupted&) {
+            return 130;
+        } catch (const std::exception& error) {
             const bool may_come = dynamic_cast<const ServerGone*>(&error) && now_ns() < give_up_ns;
             if (!may_come) {
                 std::cerr << "device bridge: " << error.what() << '\n';
@@ -321,8 +329,10 @@ Options parse(int argc, char** argv) {
         } else {
             char* end = nullptr;
             *number->second = std::strtod(value.c_str(), &end);
-            if (value.empty() || *end || !(*number->second > 0) || !std::isfinite(*number->second)) {
-                wrong(number->first, value, "a number above 0");
+            const bool may_be_zero = number->second == &options.wait_s;
+            const bool large_enough = may_be_zero ? *number->second >= 0 : *number->second > 0;
+            if (value.empty() || *end || !large_enough || *number->second > longest_s) {
+                wrong(number->first, value, may_be_zero ? "a number from 0 to 1e9" : "a number above 0, up to 1e9");
             }
         }
     }
@@ -341,7 +351,13 @@ Options parse(int argc, char** argv) {
 
 int main(int argc, char** argv) {
     const auto options = palpate::parse(argc, argv);
-    std::signal(SIGINT, palpate::on_signal);
-    std::signal(SIGTERM, palpate::on_signal);
-    return palpate::run(options);
+    for (const int number : {SIGINT, SIGTERM, SIGQUIT}) std::signal(number, palpate::on_signal);
+    // Under nohup a hang-up goes on being ignored.
+    if (std::signal(SIGHUP, palpate::on_signal) == SIG_IGN) std::signal(SIGHUP, SIG_IGN);
+    try {
+        return palpate::run(options);
+    } catch (...) {  // what nobody catches need not unwind, and the motors would keep their force
+        std::cerr << "device bridge: the device failed, and threw no std::exception\n";
+        return 1;
+    }
 }

@@ -13,8 +13,8 @@ class Device {
     // What the device itself damps: with the round trip, the server can tell from it whether the device might vibrate.
     static constexpr double damping_n_s_per_m = 0.5;
 
-    // A device that has to be opened is opened here; std::runtime_error when that fails. `inwards` is a direction of
-    // length 1, into the tissue.
+    // A device that has to be opened is opened here, and closed by the destructor; a std::exception when that fails.
+    // `inwards` is a direction of length 1, into the tissue.
     explicit Device(const Vec3& inwards) : inwards_(inwards) {}
 
     // Where the tip is, m from the undeformed surface at the contact, and how fast, m/s, along the model's axes. A
@@ -23,7 +23,8 @@ class Device {
     Vec3 velocity_m_per_s() const { return velocity_ * inwards_; }
 
     // The force on the hand from now on, N. The motors keep it until the next call, so the last one is always zero.
-    void render(const Vec3& force_n) { force_ = dot(force_n, inwards_); }
+    // Whatever else fails this is called with zero: it must not throw. (The other functions may; the bridge then ends.)
+    void render(const Vec3& force_n) noexcept { force_ = dot(force_n, inwards_); }
 
     // A real device is moved by a hand: leave this empty. Here the hand is a spring to where the person wants to be,
     // 10 mm in and back once a second, on a handle of some mass. Semi-implicit Euler: as simple as it gets, and it does

@@ -53,8 +53,13 @@ def wait_for(
 
 @pytest.fixture(scope="session", autouse=True)
 def interruptible() -> None:
-    """Tests that are run in the background of a shell inherit that Ctrl-C is ignored, and so would what they start."""
+    """Tests that are run in the background of a shell inherit that Ctrl-C is ignored, and so would what they start.
+
+    Under nohup it is the hang-up: what is handled here is as it usually is in what we start.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: None)
 
 
 @dataclass

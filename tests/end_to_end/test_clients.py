@@ -24,7 +24,9 @@ LIMITS = {"max_force_n": 1.0, "max_force_rate_n_per_s": 1000.0}
 FADE_MS = (HOLD_NS + DECAY_NS) // MS
 
 # The bridge as it is, with a driver whose motors write down where they are and each force that they are given.
+# It may begin with the hand in the tissue.
 SPIED_BRIDGE = f"""
+import os
 import sys
 from pathlib import Path
 sys.path.insert(0, {str(EXAMPLES)!r})
@@ -35,6 +37,11 @@ def spied(device, force_n):
     print(device.position_m, force_n, file=forces)
     render(device, force_n)
 device_bridge.SimulatedDevice.render = spied
+begin = device_bridge.SimulatedDevice.__init__
+def begin_there(device, *properties):
+    begin(device, *properties)
+    device.position_m = float(os.environ.get("BEGINS_AT_M", 0))
+device_bridge.SimulatedDevice.__init__ = begin_there
 sys.exit(device_bridge.main())
 """
 
@@ -338,13 +345,39 @@ def test_the_motors_are_left_without_a_force_at_the_end(
         raise AssertionError("no force at the end of any of 5 pokes")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP])
 def test_the_motors_are_left_without_a_force_by_a_signal(
     serve: Callable[..., Any], run_bridge_until_a_force: Callable[..., Bridge], number: int
 ) -> None:
     bridge = run_bridge_until_a_force(serve().endpoint)
-    assert bridge.program.stop(number) == 130
+    bridge.program.process.send_signal(number)
+    assert bridge.program.stop(number) == 130  # a terminal that is closed may well say so twice
     assert bridge.last_force() == 0
+
+
+def test_under_nohup_a_hang_up_does_not_end_the_bridge(
+    serve: Callable[..., Any], run_bridge_until_a_force: Callable[..., Bridge], wait_for: Callable[..., Any]
+) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # what is started inherits it
+    try:
+        bridge = run_bridge_until_a_force(serve().endpoint)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    bridge.program.process.send_signal(signal.SIGHUP)
+    rendered = len(bridge.rendered())
+    wait_for(lambda: len(bridge.rendered()) > rendered + 100, "further steps")
+    assert bridge.program.stop() == 130
+
+
+def test_a_hand_that_begins_in_the_tissue_has_to_leave_it_first(
+    serve: Callable[..., Any],
+    run_bridge_until_a_force: Callable[..., Bridge],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("BEGINS_AT_M", "0.01")
+    positions, forces = zip(*run_bridge_until_a_force(serve().endpoint).rendered(), strict=True)
+    assert positions[0] == 0.01
+    assert min(positions[: next(i for i, force in enumerate(forces) if force)]) <= 0
 
 
 def test_the_motors_are_left_without_a_force_when_the_server_is_killed(
@@ -365,6 +398,24 @@ def test_a_bridge_lets_go_when_the_server_says_that_it_stops(
     served = serve()
     bridge = run_bridge_until_a_force(served.endpoint)
     assert served.stop() == 0
+    code, _, err = bridge.program.finish()
+    assert code == 1
+    assert "the server is stopping" in err
+    assert "contract broken" not in err
+    assert bridge.last_force() == 0
+
+
+def test_a_bridge_that_was_held_up_when_the_server_stopped_says_that_it_stops(
+    serve: Callable[..., Any], run_bridge_until_a_force: Callable[..., Bridge]
+) -> None:
+    """It hears at once that the server stops and that it is gone."""
+    served = serve()
+    bridge = run_bridge_until_a_force(served.endpoint)
+    bridge.program.process.send_signal(signal.SIGSTOP)
+    try:
+        assert served.stop() == 0
+    finally:
+        bridge.program.process.send_signal(signal.SIGCONT)
     code, _, err = bridge.program.finish()
     assert code == 1
     assert "the server is stopping" in err
@@ -431,6 +482,20 @@ def test_a_recording_that_cannot_be_written_does_not_cost_the_summary(
     assert code == 3
     assert json.loads(out)["contract_broken"] == []
     assert err.strip() == "palpate client: /dev/full: No space left on device"
+
+
+def test_what_cannot_be_connected_with_is_told_from_a_server_that_is_not_there(
+    run_example: Callable[..., Any], tmp_path: Path
+) -> None:
+    missing = tmp_path / "missing.json5"
+    for endpoint, options, said in (
+        ("nonsense", (), "'nonsense' is no endpoint, such as tcp/127.0.0.1:7447"),
+        ("tcp/127.0.0.1:1", ("--zenoh-config", str(missing)), f"{missing}: No such file"),
+        ("tcp/127.0.0.1:1", (), "nothing answers at tcp/127.0.0.1:1"),
+    ):
+        code, _, err = run_example("device_bridge.py", endpoint, *options).finish()
+        assert code == 2
+        assert err.startswith(f"device bridge: {said}")
 
 
 @pytest.mark.parametrize("script", ["headless_client.py", "device_bridge.py"])

@@ -80,8 +80,9 @@ void check_contract() {{
 }}
 
 void check_gate() {{
-    palpate::Gate gate;
     std::int64_t silence_ns;
+    std::cin >> silence_ns;
+    palpate::Gate gate(silence_ns);
     for (bool inside; std::cin >> silence_ns >> inside;) std::cout << gate.open(silence_ns, inside);
 }}
 
@@ -110,31 +111,58 @@ int main(int, char** argv) {{
 }}
 """
 
-# The example's device, whose motors write down where they are and each force that they are given.
+# The example's device, whose motors write down where they are and each force that they are given, and which fails if that
+# is wanted; and its driver, which is linked.
 SPIED_DEVICE = f"""
 #define Device SimulatedDevice
 #include "{SOURCE / "simulated_device.hpp"}"
 #undef Device
-#include <cstdio>
 #include <cstdlib>
+#include <stdexcept>
+#include <string>
+#include <driver.h>
 
 namespace palpate {{
 
 class Device : public SimulatedDevice {{
    public:
     explicit Device(const Vec3& inwards) : SimulatedDevice(inwards), along_(inwards) {{}}
-    void render(const Vec3& force_n) {{
-        std::fprintf(file_, "%.17g %.17g\\n", dot(position_m(), along_), dot(force_n, along_));
+    ~Device() {{
+        std::fclose(file_);
+        std::fclose(driver_open((rendered_ + ".closed").c_str()));
+    }}
+    void render(const Vec3& force_n) noexcept {{
+        const double force = dot(force_n, along_);
+        std::fprintf(file_, "%.17g %.17g\\n", dot(SimulatedDevice::position_m(), along_), force);
         std::fflush(file_);
         SimulatedDevice::render(force_n);
+        pushes_ = force != 0;
+    }}
+    Vec3 position_m() const {{
+        if (pushes_ && fails_ == "logic_error") throw std::logic_error("the encoder is upside down");
+        if (pushes_ && fails_ == "int") throw 42;
+        return SimulatedDevice::position_m();
     }}
 
    private:
     Vec3 along_;
-    std::FILE* file_ = std::fopen(std::getenv("RENDERED"), "w");
+    bool pushes_ = false;
+    std::string rendered_ = std::getenv("RENDERED"), fails_ = std::getenv("FAILS") ? std::getenv("FAILS") : "";
+    std::FILE* file_ = driver_open(rendered_.c_str());
 }};
 
 }}  // namespace palpate
+"""
+
+
+DRIVER_HEADER = """
+#include <cstdio>
+std::FILE* driver_open(const char* path);
+"""
+
+DRIVER = """
+#include "driver.h"
+std::FILE* driver_open(const char* path) { return std::fopen(path, "w"); }
 """
 
 
@@ -292,7 +320,7 @@ def test_a_force_that_breaks_the_contract_is_not_rendered(listen: Callable[..., 
 
 
 def test_the_tip_stays_out_after_a_gap_until_the_hand_has_left_the_tissue(listen: Callable[..., str]) -> None:
-    fresh, old = 20 * MS, 20 * MS + 1
+    fresh, old = 30 * MS, 30 * MS + 1
     told = [
         (fresh, 1, "0"),  # it begins in the tissue
         (fresh, 0, "0"),
@@ -307,7 +335,7 @@ def test_the_tip_stays_out_after_a_gap_until_the_hand_has_left_the_tissue(listen
         (fresh, 0, "0"),
         (fresh, 1, "1"),
     ]
-    said = listen("gate", "\n".join(f"{silence} {inside}" for silence, inside, _ in told))
+    said = listen("gate", "\n".join([f"{fresh}", *(f"{silence} {inside}" for silence, inside, _ in told)]))
     assert said == "".join(is_open for _, _, is_open in told)
 
 
@@ -324,10 +352,21 @@ def bridge(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if not shutil.which("cmake"):
         pytest.skip("there is no cmake")
     (folder / "spied_device.hpp").write_text(SPIED_DEVICE)
+    (folder / "driver").mkdir()
+    (folder / "driver" / "driver.h").write_text(DRIVER_HEADER)
+    (folder / "driver" / "driver.cpp").write_text(DRIVER)
+    compiler = os.environ.get("CXX") or shutil.which("c++")
+    if not compiler:
+        pytest.skip("there is no C++ compiler")
+    library = folder / "driver" / "libdriver.so"
+    command = [compiler, "-shared", "-fPIC", "driver.cpp", "-o", library]
+    subprocess.run(command, cwd=library.parent, check=True, timeout=120)
     configured = subprocess.run(
         [
             *("cmake", "-S", SOURCE, "-B", folder / "build", "-DCMAKE_CXX_FLAGS=-Werror"),
             f"-DDEVICE_HEADER={folder / 'spied_device.hpp'}",
+            f"-DDEVICE_INCLUDE_DIRS={library.parent}",
+            f"-DDEVICE_LIBRARIES={library}",
         ],
         capture_output=True,
         text=True,
@@ -370,6 +409,9 @@ class Run:
         pairs = [line.split() for line in lines if line.endswith("\n")]
         return [(float(position), float(force)) for position, force in pairs]
 
+    def device_was_closed(self) -> bool:
+        return self.rendered.with_name("rendered.closed").exists()
+
     def forces(self) -> list[float]:
         return [force for _, force in self.positions_and_forces()]
 
@@ -406,23 +448,32 @@ def run_bridge(bridge: Path, tmp_path: Path) -> Iterator[Callable[..., Run]]:
 def test_the_bridge_renders_forces_keeps_the_contract_and_leaves_the_motors_without_a_force(
     serve: Callable[..., Any], run_bridge: Callable[..., Run]
 ) -> None:
-    # It ends in the middle of a poke, with the tip in the tissue.
-    run = run_bridge(serve().endpoint, "--duration-s", "1.5")
-    code, out, err = run.finish()
-    assert code == 0, err
-    assert re.search(r"contract +held", out)
-    answered, sent = map(int, re.search(r"commands answered +(\d+) of (\d+)", out).groups())  # type: ignore[union-attr]
-    assert 0 < answered <= sent
-    assert float(re.search(r"round trip told +(\d+)", out)[1]) > 0  # type: ignore[index]
-    positions, forces = zip(*run.positions_and_forces(), strict=True)
-    assert forces[-2] != 0
-    assert forces[-1] == 0
+    served = serve()
+    for _ in range(5):  # on a busy machine the force may have been late, and let go before the end
+        # It ends in the middle of a poke, with the tip in the tissue.
+        run = run_bridge(served.endpoint, "--duration-s", "1.5")
+        code, out, err = run.finish()
+        assert code == 0, err
+        assert re.search(r"contract +held", out)
+        answered, sent = map(int, re.search(r"commands answered +(\d+) of (\d+)", out).groups())  # type: ignore[union-attr]
+        assert 0 < answered <= sent
+        assert float(re.search(r"round trip told +(\d+)", out)[1]) > 0  # type: ignore[index]
+        positions, forces = zip(*run.positions_and_forces(), strict=True)
+        assert forces[-1] == 0
+        assert run.device_was_closed()
+        if forces[-2] != 0:
+            break
+    else:
+        raise AssertionError("no force at the end of any of 5 pokes")
     # The hand feels a push outwards, and nothing outside of the tissue.
     assert min(forces) < 0
     assert all(force == 0 for position, force in zip(positions, forces, strict=True) if position <= 0)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP]
+
+
+@pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_leaves_the_motors_without_a_force_and_the_contact_free(
     serve: Callable[..., Any], run_bridge: Callable[..., Run], connect: Callable[..., Any], number: int
 ) -> None:
@@ -436,6 +487,53 @@ def test_a_signal_leaves_the_motors_without_a_force_and_the_contact_free(
     assert code == 130, err
     assert re.search(r"contract +held", out)
     assert run.forces()[-1] == 0
+
+
+def test_a_signal_before_the_first_force_closes_the_device_too(
+    serve: Callable[..., Any], run_bridge: Callable[..., Run]
+) -> None:
+    run = run_bridge(serve().endpoint, "--duration-s", "60")
+    run.wait_for(run.forces, "open device")  # then for 1.5 s round trips are measured
+    run.process.send_signal(signal.SIGTERM)
+    code, _, err = run.finish()
+    assert code == 130, err
+    assert set(run.forces()) == {0.0}
+    assert run.device_was_closed()
+
+
+def test_a_signal_while_the_bridge_waits_for_a_server_to_come_again_closes_the_device_too(
+    serve: Callable[..., Any], run_bridge: Callable[..., Run]
+) -> None:
+    served = serve()
+    run = run_bridge(served.endpoint, "--duration-s", "60", "--wait-s", "60")
+    run.wait_for_a_force()
+    served.process.kill()
+    run.wait_for_none()
+    time.sleep(0.5)
+    run.process.send_signal(signal.SIGTERM)
+    code, _, err = run.finish()
+    assert code == 130, err
+    assert run.device_was_closed()
+
+
+@pytest.mark.parametrize(
+    ("thrown", "said"), [("logic_error", "the encoder is upside down"), ("int", "the device failed")]
+)
+def test_a_device_that_fails_is_left_without_a_force_whatever_it_throws(
+    serve: Callable[..., Any],
+    run_bridge: Callable[..., Run],
+    monkeypatch: pytest.MonkeyPatch,
+    thrown: str,
+    said: str,
+) -> None:
+    monkeypatch.setenv("FAILS", thrown)
+    run = run_bridge(serve().endpoint, "--duration-s", "60")
+    code, _, err = run.finish()
+    assert code == 1
+    assert f"device bridge: {said}" in err
+    assert run.forces()[-2] != 0
+    assert run.forces()[-1] == 0
+    assert run.device_was_closed()
 
 
 def test_a_killed_server_is_told_of_and_leaves_the_motors_without_a_force(
@@ -460,8 +558,27 @@ def test_a_server_that_stops_is_told_of_and_leaves_the_motors_without_a_force(
     served.process.send_signal(signal.SIGTERM)
     code, _, err = run.finish()
     assert code == 1
-    # It takes the contact back, says that it stops, and goes: which of it is heard first is a matter of milliseconds.
-    assert re.search("the server is stopping|the server is gone|the contact is no longer ours", err)
+    assert "the server is stopping" in err  # it says so first, and its forces fade by silence
+    assert "contract broken" not in err
+    assert run.forces()[-1] == 0
+
+
+def test_a_bridge_that_was_held_up_when_the_server_stopped_says_that_it_stops(
+    serve: Callable[..., Any], run_bridge: Callable[..., Run]
+) -> None:
+    """It hears at once that the server stops and that it is gone."""
+    served = serve()
+    run = run_bridge(served.endpoint, "--duration-s", "60")
+    run.wait_for_a_force()
+    run.process.send_signal(signal.SIGSTOP)
+    try:
+        assert served.stop() == 0
+    finally:
+        run.process.send_signal(signal.SIGCONT)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "the server is stopping" in err
+    assert "contract broken" not in err
     assert run.forces()[-1] == 0
 
 
@@ -525,6 +642,13 @@ def test_with_a_server_that_comes_again_all_is_agreed_anew(
         (("--name", ""), "argument --name"),
         (("--duration-s", "0"), "argument --duration-s"),
         (("--duration-s", "nan"), "argument --duration-s"),
+        (("--duration-s", "1e10"), "argument --duration-s: '1e10' is not a number above 0, up to 1e9"),
+        (("--wait-s", "1e10"), "argument --wait-s: '1e10' is not a number from 0 to 1e9"),
+        (("--wait-s", "-1"), "argument --wait-s"),
+        (("--wait-s", "0"), "nothing answers at tcp/127.0.0.1:1"),
+        # Waiting would not help.
+        (("--wait-s", "60", "--connect", "nonsense"), "'nonsense' is no endpoint"),
+        (("--wait-s", "60", "--zenoh-config", "missing.json5"), "missing.json5"),
         (("--force", "1"), "usage"),
         (("--device",), "usage"),
         ((), "nothing answers at tcp/127.0.0.1:1"),
