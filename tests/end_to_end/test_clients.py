@@ -24,10 +24,11 @@ LIMITS = {"max_force_n": 1.0, "max_force_rate_n_per_s": 1000.0}
 FADE_MS = (HOLD_NS + DECAY_NS) // MS
 
 # The bridge as it is, with a driver whose motors write down where they are and each force that they are given.
-# It may begin with the hand in the tissue.
+# It may begin with the hand in the tissue, or hold the loop up at the first force until a file is there.
 SPIED_BRIDGE = f"""
 import os
 import sys
+import time
 from pathlib import Path
 sys.path.insert(0, {str(EXAMPLES)!r})
 import device_bridge
@@ -36,6 +37,8 @@ render = device_bridge.SimulatedDevice.render
 def spied(device, force_n):
     print(device.position_m, force_n, file=forces)
     render(device, force_n)
+    while force_n and "HELD_UP_UNTIL" in os.environ and not Path(os.environ["HELD_UP_UNTIL"]).exists():
+        time.sleep(0.01)
 device_bridge.SimulatedDevice.render = spied
 begin = device_bridge.SimulatedDevice.__init__
 def begin_there(device, *properties):
@@ -406,16 +409,18 @@ def test_a_bridge_lets_go_when_the_server_says_that_it_stops(
 
 
 def test_a_bridge_that_was_held_up_when_the_server_stopped_says_that_it_stops(
-    serve: Callable[..., Any], run_bridge_until_a_force: Callable[..., Bridge]
+    serve: Callable[..., Any],
+    run_bridge_until_a_force: Callable[..., Bridge],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
-    """It hears at once that the server stops and that it is gone."""
+    """Its loop learns at once that the server stops and that it is gone."""
+    monkeypatch.setenv("HELD_UP_UNTIL", str(go_on := tmp_path / "go_on"))
     served = serve()
     bridge = run_bridge_until_a_force(served.endpoint)
-    bridge.program.process.send_signal(signal.SIGSTOP)
-    try:
-        assert served.stop() == 0
-    finally:
-        bridge.program.process.send_signal(signal.SIGCONT)
+    assert served.stop() == 0
+    time.sleep(0.5)  # until the bridge has heard it
+    go_on.touch()
     code, _, err = bridge.program.finish()
     assert code == 1
     assert "the server is stopping" in err

@@ -111,8 +111,8 @@ int main(int, char** argv) {{
 }}
 """
 
-# The example's device, whose motors write down where they are and each force that they are given, and which fails if that
-# is wanted; and its driver, which is linked.
+# The example's device, whose motors write down where they are and each force that they are given, which fails if that is
+# wanted, or holds the loop up at the first force until a file is there; and its driver, which is linked.
 SPIED_DEVICE = f"""
 #define Device SimulatedDevice
 #include "{SOURCE / "simulated_device.hpp"}"
@@ -121,6 +121,7 @@ SPIED_DEVICE = f"""
 #include <stdexcept>
 #include <string>
 #include <driver.h>
+#include <unistd.h>
 
 namespace palpate {{
 
@@ -137,6 +138,8 @@ class Device : public SimulatedDevice {{
         std::fflush(file_);
         SimulatedDevice::render(force_n);
         pushes_ = force != 0;
+        const char* held_up_until = std::getenv("HELD_UP_UNTIL");
+        while (pushes_ && held_up_until && access(held_up_until, F_OK)) usleep(10'000);
     }}
     Vec3 position_m() const {{
         if (pushes_ && fails_ == "logic_error") throw std::logic_error("the encoder is upside down");
@@ -564,17 +567,19 @@ def test_a_server_that_stops_is_told_of_and_leaves_the_motors_without_a_force(
 
 
 def test_a_bridge_that_was_held_up_when_the_server_stopped_says_that_it_stops(
-    serve: Callable[..., Any], run_bridge: Callable[..., Run]
+    serve: Callable[..., Any],
+    run_bridge: Callable[..., Run],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
-    """It hears at once that the server stops and that it is gone."""
+    """Its loop learns at once that the server stops and that it is gone."""
+    monkeypatch.setenv("HELD_UP_UNTIL", str(go_on := tmp_path / "go_on"))
     served = serve()
     run = run_bridge(served.endpoint, "--duration-s", "60")
     run.wait_for_a_force()
-    run.process.send_signal(signal.SIGSTOP)
-    try:
-        assert served.stop() == 0
-    finally:
-        run.process.send_signal(signal.SIGCONT)
+    assert served.stop() == 0
+    time.sleep(0.5)  # until the bridge has heard it
+    go_on.touch()
     code, _, err = run.finish()
     assert code == 1
     assert "the server is stopping" in err
