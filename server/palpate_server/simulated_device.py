@@ -19,13 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.model import ReducedModel
-from palpate_server import layout, loop
+from palpate_server import layout, loop, wire
 from palpate_server.image import make_image
 from palpate_server.round_trips import Trace
 from palpate_server.safety import Limits
 
 SHAKING_M = 1e-5  # what a hand hardly feels
-_STILL = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ def press(
                 told = rendered[command - 1] if command > 0 else -1
                 x, y, z = (depths[command] * inwards).tolist()
                 loop.write_command(
-                    memory.commands, 0, command, 0, arrival_ns[tick], told, lease, (x, y, z), _STILL
+                    memory.commands, 0, command, 0, arrival_ns[tick], told, lease, (x, y, z), wire.STILL
                 )
             loop.repeat_tick(image, server_ns[tick])
             forces.append(float(memory.device_force[0] @ inwards))
