@@ -20,7 +20,7 @@ ENV PATH=/opt/palpate/bin:$PATH \
 USER 10001
 WORKDIR /models
 # The kernels are compiled here, as the user that will run them: the server then starts in about a second.
-RUN python -c "from palpate_server.server import warm_up; warm_up(0.001, 1)"
+RUN python -c "from palpate_server.session.server import warm_up; warm_up(0.001, 1)"
 EXPOSE 7447
 STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=10s --timeout=5s --start-period=10s --retries=3 \

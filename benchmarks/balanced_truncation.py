@@ -41,7 +41,7 @@ def cube(counts: tuple[int, int, int]) -> dict[str, Array]:
     """Mass-normalised stiffness blocks of the paper's cube (section 4.2), its contact the nodes at the top centre."""
     from palpate.discretization import conservative
     from palpate.geometry.shapes import box_lattice
-    from palpate.material import PRESETS
+    from palpate.scene.material import PRESETS
 
     material = PRESETS["paper-cube"]
     cloud = box_lattice((0, 0, 0), (1, 1, 1), counts)
@@ -84,9 +84,9 @@ def first_order(body: dict[str, Array]) -> tuple[Array, Array, Array, Array]:
 
 def full_system(body: dict[str, Array]) -> Any:
     """The exact diagonal system of the same matrices."""
-    from palpate.material import PronySeries
-    from palpate.system import ElasticModes
-    from palpate.viscoelastic import viscoelastic_system
+    from palpate.lti.viscoelastic import viscoelastic_system
+    from palpate.modes.elastic_modes import ElasticModes
+    from palpate.scene.material import PronySeries
 
     mu, vectors = np.linalg.eigh(body["stiffness"])
     b = vectors.T @ body["coupling"]
@@ -151,7 +151,7 @@ def reduced_by(contender: str, body: dict[str, Array], order: int) -> tuple[Any,
 
 def work(contender: str, path: Path, order: int) -> dict[str, float]:
     """One contender's figures."""
-    from palpate.reduction.frequencies import all_frequencies, spectral_norms
+    from palpate.lti.frequencies import all_frequencies, spectral_norms
 
     with np.load(path) as archive:
         body = dict(archive)

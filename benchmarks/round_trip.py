@@ -15,10 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.model import load_model, save_model
+from palpate.model_file import load_model, save_model
 from palpate_server import wire
-from palpate_server.round_trips import RATE_HZ, RoundTrips, encode_command, ping_pong, through_a_model
-from palpate_server.sample_model import spring_mass_model
+from palpate_server.diagnostics.round_trips import (
+    RATE_HZ,
+    RoundTrips,
+    encode_command,
+    ping_pong,
+    through_a_model,
+)
+from palpate_server.diagnostics.sample_model import spring_mass_model
 
 
 def main() -> None:

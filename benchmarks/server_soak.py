@@ -25,12 +25,14 @@ import msgpack
 import numpy as np
 import psutil
 
-from palpate.model import load_model, save_model
-from palpate_server import layout, transport, wire
-from palpate_server.round_trips import free_endpoint
-from palpate_server.safety import Limits
-from palpate_server.sample_model import spring_mass_model
-from palpate_server.server import Server
+from palpate.model_file import load_model, save_model
+from palpate_server import wire
+from palpate_server.diagnostics.round_trips import free_endpoint
+from palpate_server.diagnostics.sample_model import spring_mass_model
+from palpate_server.realtime import shared_memory
+from palpate_server.realtime.safety import Limits
+from palpate_server.session import transport
+from palpate_server.session.server import Server
 
 CLIENT = Path(__file__).parents[1] / "client_examples" / "headless_client.py"
 SAMPLE_S = 10.0
@@ -170,7 +172,10 @@ def draw(histograms: Any, longest_ns: Any, memory: list[tuple[float, float]], pa
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    for row, label in ((layout.TIMER_LATENESS, "deadline timer"), (layout.TICK_LATENESS, "tick")):
+    for row, label in (
+        (shared_memory.TIMER_LATENESS, "deadline timer"),
+        (shared_memory.TICK_LATENESS, "tick"),
+    ):
         counts = histograms[row]
         edges = np.unique(np.round(np.geomspace(1, len(counts), 60)).astype(int)) - 1
         sums = np.add.reduceat(counts, edges[:-1])

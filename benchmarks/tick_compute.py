@@ -26,10 +26,12 @@ from numba import njit
 from numba.core.runtime import _nrt_python as _nrt
 from numba.core.runtime import rtsys
 
-from palpate_server import kernel, layout, loop, wire
-from palpate_server.image import make_image
-from palpate_server.safety import Limits
-from palpate_server.sample_model import spring_mass_model
+from palpate_server import wire
+from palpate_server.bodies import state_space
+from palpate_server.diagnostics.sample_model import spring_mass_model
+from palpate_server.realtime import scheduler, shared_memory
+from palpate_server.realtime.native_image import make_image
+from palpate_server.realtime.safety import Limits
 
 STEPS = 1_000
 
@@ -38,8 +40,8 @@ STEPS = 1_000
 def run_blocks(n, diagonal, cross, b_transposed, c, d, state, inputs, force):
     for k in range(n):
         u = inputs[k % inputs.shape[0]]
-        kernel.output(c, d, state, u, force)
-        kernel.update(diagonal, cross, b_transposed, state, u)
+        state_space.output(c, d, state, u, force)
+        state_space.update(diagonal, cross, b_transposed, state, u)
 
 
 @njit
@@ -71,9 +73,9 @@ def run_ticks(n, commands, image, start, period):
         now = start + k * period
         depth = (0.0, 0.0, 1e-3 * (k % 64))
         for contact in range(1, commands.lease.size):
-            loop.stage_command(commands, contact, k, 1, now, -1, 0, depth, (0.0, 0.0, 0.0))
-        loop.write_command(commands, 0, k, 1, now, -1, 0, depth, (0.0, 0.0, 0.0))
-        loop.repeat_tick(image, now)
+            scheduler.stage_command(commands, contact, k, 1, now, -1, 0, depth, (0.0, 0.0, 0.0))
+        scheduler.write_command(commands, 0, k, 1, now, -1, 0, depth, (0.0, 0.0, 0.0))
+        scheduler.repeat_tick(image, now)
 
 
 def allocations(function: Callable[[], None]) -> int:
@@ -110,23 +112,23 @@ def row(order: int, contacts: int, runs: int) -> None:
     model = spring_mass_model(contacts, order // 2)
     system, channels = model.discrete, 3 * contacts
     inputs = np.random.default_rng(0).normal(size=(64, channels)) * 1e-3
-    blocks = layout.make_model(system)
+    blocks = shared_memory.make_model(system)
     force = np.zeros(channels)
     b, c, d = blocks.b_transposed, blocks.c, blocks.d
     blocks_args = (blocks.diagonal, blocks.cross, b, c, d, blocks.state, inputs, force)
-    dense = [kernel.aligned(matrix) for matrix in (system.dense_a(), system.b, system.c, system.d)]
-    dense_state, dense_force = kernel.aligned(np.zeros(order)), np.zeros(channels)
+    dense = [state_space.aligned(matrix) for matrix in (system.dense_a(), system.b, system.c, system.d)]
+    dense_state, dense_force = state_space.aligned(np.zeros(order)), np.zeros(channels)
     scratch = (np.zeros(order), np.zeros(channels), np.zeros(order))
     dense_args = (*dense, dense_state, inputs, dense_force, *scratch)
     run_blocks(1000, *blocks_args)
     run_blas(1000, *dense_args)
     np.testing.assert_allclose(blocks.state, dense_state, atol=1e-9 * np.abs(dense_state).max())
     np.testing.assert_allclose(force, dense_force, atol=1e-9 * np.abs(dense_force).max())
-    matrices = tuple(kernel.aligned(matrix.ravel()) for matrix in (b, c, d))
+    matrices = tuple(state_space.aligned(matrix.ravel()) for matrix in (b, c, d))
     run_reads(1, matrices)
 
     limits = Limits(10.0, 2000.0, 1.0, 0.1, 4.0)
-    memory = layout.make_memory(system, model.period_s, [limits] * contacts, 1 / 30)
+    memory = shared_memory.make_memory(system, model.period_s, [limits] * contacts, 1 / 30)
     ticks_args = (memory.commands, make_image(memory), time.monotonic_ns(), int(memory.period_ns[0]))
     run_ticks(1, *ticks_args)
     entry, ticks = (allocations(lambda n=n: run_ticks(n, *ticks_args)) for n in (0, STEPS))

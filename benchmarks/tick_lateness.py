@@ -17,10 +17,10 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from palpate.model import load_model, save_model
-from palpate_server import realtime
-from palpate_server.round_trips import through_a_model
-from palpate_server.sample_model import spring_mass_model
+from palpate.model_file import load_model, save_model
+from palpate_server.diagnostics.round_trips import through_a_model
+from palpate_server.diagnostics.sample_model import spring_mass_model
+from palpate_server.realtime import threads
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     options = parser.parse_args()
     fifo = may_use_fifo()
-    print(f"scheduling policy: {'FIFO ' + str(realtime.LOOP_PRIORITY) if fifo else 'OTHER'}")
+    print(f"scheduling policy: {'FIFO ' + str(threads.LOOP_PRIORITY) if fifo else 'OTHER'}")
     ours, floor = [], []
     with tempfile.TemporaryDirectory() as folder:
         path = options.model or Path(folder) / "sample.npz"
@@ -58,7 +58,7 @@ def may_use_fifo() -> bool:
     result: list[bool] = []
 
     def attempt() -> None:
-        result.append(realtime.raise_priority() is None)
+        result.append(threads.raise_priority() is None)
 
     thread = threading.Thread(target=attempt)
     thread.start()
@@ -85,7 +85,7 @@ def cyclictest(seconds: float, fifo: bool, output: Path) -> subprocess.Popen[str
     )
     if program is None:
         raise SystemExit("cyclictest is not installed (Debian: apt install rt-tests)")
-    policy = ["-p", str(realtime.LOOP_PRIORITY)] if fifo else ["--policy=other"]
+    policy = ["-p", str(threads.LOOP_PRIORITY)] if fifo else ["--policy=other"]
     command = [program, "-q", "-m", "-t1", "-i1000", "-D", str(int(seconds)), "-h", "20000", *policy]
     with output.open("w") as file:
         return subprocess.Popen(command, stdout=file, stderr=subprocess.DEVNULL, text=True)

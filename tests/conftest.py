@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from palpate.model import ReducedModel
-from palpate_server.sample_model import spring_mass_model
+from palpate.model_file import ReducedModel
+from palpate_server.diagnostics.sample_model import spring_mass_model
 
 SLAB = """
 name = "slab"

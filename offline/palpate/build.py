@@ -10,7 +10,28 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.config import (
+from palpate.discretization import collocation, conservative
+from palpate.discretization.nodal import NodalValues, nodal_shape_functions
+from palpate.discretization.resolution import resolved_frequency_hz
+from palpate.geometry import regions
+from palpate.geometry.cloud import NodeCloud, TriangleSurface
+from palpate.geometry.fill import fill_surface
+from palpate.geometry.refinement import refine_surface
+from palpate.geometry.regions import ContactPatch, contact_patch, nodes_in
+from palpate.geometry.shapes import ball, box_lattice
+from palpate.geometry.spacing import Refinement, SpacingField
+from palpate.geometry.surface import load_surface
+from palpate.lti.pole_residue import DiagonalSystem
+from palpate.lti.sampling import discretise, sampled_response
+from palpate.lti.viscoelastic import viscoelastic_system
+from palpate.meshfree import shape_functions
+from palpate.model_file import Contact, PoleResidueSystem, ReducedModel, Surface
+from palpate.modes.elastic_modes import ElasticModes
+from palpate.reduction.evidence import measure
+from palpate.reduction.methods import reduce
+from palpate.reduction.surface import fit_surface_output
+from palpate.scene.material import Material
+from palpate.scene.schema import (
     BallGeometry,
     BoxGeometry,
     BoxRegion,
@@ -23,27 +44,6 @@ from palpate.config import (
     canonical_text,
     fingerprint,
 )
-from palpate.diagonal_system import DiagonalSystem
-from palpate.discretization import collocation, conservative
-from palpate.discretization.nodal import NodalValues, nodal_shape_functions
-from palpate.discretization.resolution import resolved_frequency_hz
-from palpate.geometry import regions
-from palpate.geometry.cloud import NodeCloud, TriangleSurface
-from palpate.geometry.fill import fill_surface
-from palpate.geometry.refinement import refine_surface
-from palpate.geometry.regions import ContactPatch, contact_patch, nodes_in
-from palpate.geometry.shapes import ball, box_lattice
-from palpate.geometry.spacing import Refinement, SpacingField
-from palpate.geometry.surface import load_surface
-from palpate.material import Material
-from palpate.meshfree import shape_functions
-from palpate.model import Contact, PoleResidueSystem, ReducedModel, Surface
-from palpate.reduction.evidence import measure
-from palpate.reduction.methods import reduce
-from palpate.reduction.sampling import discretise, sampled_response
-from palpate.reduction.surface import fit_surface_output
-from palpate.system import ElasticModes
-from palpate.viscoelastic import viscoelastic_system
 
 Array = NDArray[np.float64]
 

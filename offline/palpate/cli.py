@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 if TYPE_CHECKING:
-    from palpate.model import ReducedModel
+    from palpate.model_file import ReducedModel
 
 app = typer.Typer(
     name="palpate",
@@ -89,8 +89,8 @@ def build(
     ] = None,
 ) -> None:
     """Build a scene into a model file and print the evidence of its accuracy."""
-    from palpate.config import load_config, override_reduction
-    from palpate.model import check_writable, save_model
+    from palpate.model_file import check_writable, save_model
+    from palpate.scene.schema import load_config, override_reduction
 
     if order is not None and tolerance is not None:
         raise ValueError("--order and --tolerance exclude each other: expected at most one of them")
@@ -119,7 +119,7 @@ def inspect(
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable, on standard output.")] = False,
 ) -> None:
     """Say what a model file holds and how good it is."""
-    from palpate.model import load_model
+    from palpate.model_file import load_model
 
     loaded = load_model(model)
     if as_json:
@@ -137,19 +137,19 @@ def serve(context: typer.Context) -> None:
 @app.command(context_settings=PASS_THROUGH)
 def record(context: typer.Context) -> None:
     """Record a running server's commands, forces and status to an MCAP file (`palpate record --help`)."""
-    _run_server_tool("palpate_server.record", context.args)
+    _run_server_tool("palpate_server.recording.record", context.args)
 
 
 @app.command(context_settings=PASS_THROUGH)
 def replay(context: typer.Context) -> None:
     """Repeat a recording offline through a model and compare bit for bit (`palpate replay --help`)."""
-    _run_server_tool("palpate_server.replay", context.args)
+    _run_server_tool("palpate_server.recording.replay", context.args)
 
 
 @app.command(name="check-host", context_settings=PASS_THROUGH)
 def check_host(context: typer.Context) -> None:
     """Measure whether this machine can hold 1 kHz, and say what to change (`palpate check-host --help`)."""
-    _run_server_tool("palpate_server.check_host", context.args)
+    _run_server_tool("palpate_server.diagnostics.check_host", context.args)
 
 
 @app.command(context_settings=PASS_THROUGH)
@@ -190,7 +190,7 @@ def reproduce(
     """Regenerate the figures of BaniHani & De 2009, and three beyond them, each as a plot and a table."""
     with stage_reporter() as report:
         report("libraries")
-        from palpate.experiments.reproduce import reproduce
+        from palpate_paper.reproduce import reproduce
 
         written = reproduce(figure or [], out, quick, report)
     for path in written:

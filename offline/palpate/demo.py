@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from palpate.build import Report, build_model
-from palpate.config import fingerprint, load_config
-from palpate.diagonal_system import full_system
-from palpate.model import ModelFileError, ReducedModel, load_model, save_model
+from palpate.lti.pole_residue import full_system
+from palpate.model_file import ModelFileError, ReducedModel, load_model, save_model
 from palpate.plots import Touch, draw_touch, require_matplotlib
+from palpate.scene.schema import fingerprint, load_config
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from palpate.model import ReducedModel
+from palpate.model_file import ReducedModel
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from palpate.model import ReducedModel
+from palpate.model_file import ReducedModel
 
 _NOTABLE = 0.1  # a relative error above this is not what a model is built for
 

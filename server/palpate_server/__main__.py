@@ -16,11 +16,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import zenoh
 
-from palpate.model import ModelFileError, load_model
-from palpate_server import transport, wire
+from palpate.model_file import ModelFileError, load_model
+from palpate_server import wire
 from palpate_server.arguments import index, need, positive
-from palpate_server.safety import Limits, least_force_rate
-from palpate_server.server import FASTEST_SURFACE_HZ, USUAL_SURFACE_HZ, serve
+from palpate_server.realtime.safety import Limits, least_force_rate
+from palpate_server.session import transport
+from palpate_server.session.server import FASTEST_SURFACE_HZ, USUAL_SURFACE_HZ, serve
 
 EXIT_REFUSED = 2
 

@@ -15,7 +15,7 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_server.compiled import compiled
+from palpate_server.realtime.compiled import compiled
 
 SCHEMA_VERSION = 1
 ACTIONS = ("acquire", "release", "limits", "reset", "load", "record")  # of control queries

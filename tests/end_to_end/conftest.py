@@ -24,9 +24,9 @@ import msgpack
 import pytest
 import zenoh
 
-from palpate.model import ReducedModel, save_model
-from palpate_server.round_trips import free_endpoint
-from palpate_server.sample_model import spring_mass_model
+from palpate.model_file import ReducedModel, save_model
+from palpate_server.diagnostics.round_trips import free_endpoint
+from palpate_server.diagnostics.sample_model import spring_mass_model
 
 EXAMPLES = Path(__file__).parents[2] / "client_examples"
 SESSION = "test"

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.diagonal_system import full_system
-from palpate.model import ReducedModel, load_model
+from palpate.lti.pole_residue import full_system
+from palpate.model_file import ReducedModel, load_model
 from palpate.plots import Touch
 from palpate.reduction.evidence import step_through
-from palpate_server.replay import read_session
-from palpate_server.round_trips import free_endpoint
+from palpate_server.diagnostics.round_trips import free_endpoint
+from palpate_server.recording.replay import read_session
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from palpate_client_examples.contract import Contract
 
-from palpate_server.safety import DECAY_NS, HOLD_NS, Flags
+from palpate_server.realtime.safety import DECAY_NS, HOLD_NS, Flags
 
 EXAMPLES = Path(__file__).parents[2] / "client_examples"
 MS = 1_000_000

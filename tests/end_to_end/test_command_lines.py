@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
-from palpate.model import ReducedModel, save_model
-from palpate_server import check_host, record
+from palpate.model_file import ReducedModel, save_model
 from palpate_server.__main__ import main as serve_main
+from palpate_server.diagnostics import check_host
+from palpate_server.recording import record
 
 
 def assert_is_refused(program: Any, words: str) -> None:
@@ -42,13 +43,13 @@ def test_a_recording_that_exists_is_not_written_over(
     out.write_bytes(b"an hour of work")
     served = serve()
     options = ("--session", "test", "--duration-s", "0.1", "--connect", served.endpoint)
-    assert_is_refused(start("-m", "palpate_server.record", out, *options), "earlier.mcap exists")
+    assert_is_refused(start("-m", "palpate_server.recording.record", out, *options), "earlier.mcap exists")
     assert out.read_bytes() == b"an hour of work"
 
 
 def test_without_a_server_no_file_is_left_behind(start: Callable[..., Any], tmp_path: Path) -> None:
     out = tmp_path / "new.mcap"
-    recorder = start("-m", "palpate_server.record", out, "--connect", "tcp/127.0.0.1:1")
+    recorder = start("-m", "palpate_server.recording.record", out, "--connect", "tcp/127.0.0.1:1")
     assert_is_refused(recorder, "tcp/127.0.0.1:1")
     assert not out.exists()
 

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from palpate_server import wire
-from palpate_server.round_trips import free_endpoint
-from palpate_server.safety import Flags
+from palpate_server.diagnostics.round_trips import free_endpoint
+from palpate_server.realtime.safety import Flags
 
 # Of the server below. A press of DEPTH_M (50 N/m when it has settled, more before) goes beyond the largest force, and
 # one tick may change it by a fiftieth of that: the lowest rate that is accepted, so a step beyond it has room to show.

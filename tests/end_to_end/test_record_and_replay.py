@@ -17,15 +17,15 @@ import pytest
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from palpate.model import ReducedModel, load_model, save_model
-from palpate_server import replay
+from palpate.model_file import ReducedModel, load_model, save_model
+from palpate_server.recording import replay
 
 
 @pytest.fixture
 def start_recorder(start: Callable[..., Any]) -> Callable[..., Any]:
     def start_recorder(out: Path, endpoint: str) -> Any:
         options = ("--connect", endpoint, "--session", "test")
-        return start("-m", "palpate_server.record", out, *options, ready="recording")
+        return start("-m", "palpate_server.recording.record", out, *options, ready="recording")
 
     return start_recorder
 

@@ -17,10 +17,10 @@ import pytest
 import zenoh
 from mcap.reader import make_reader
 
-from palpate.model import save_model
+from palpate.model_file import save_model
 from palpate_server import wire
-from palpate_server.round_trips import free_endpoint
-from palpate_server.sample_model import spring_mass_model
+from palpate_server.diagnostics.round_trips import free_endpoint
+from palpate_server.diagnostics.sample_model import spring_mass_model
 
 EXAMPLE = Path(__file__).parents[2] / "configs" / "security"
 CLIENT = Path(__file__).parents[2] / "client_examples" / "headless_client.py"
@@ -257,7 +257,7 @@ def test_a_recorder_records_the_commands_of_an_operator(
 ) -> None:
     out = tmp_path / "session.mcap"
     options = (out, "--zenoh-config", folder / "recorder.json5")
-    recorder = start("-m", "palpate_server.record", *options, ready="recording")
+    recorder = start("-m", "palpate_server.recording.record", *options, ready="recording")
     code, _, err = run_client(folder, "operator").finish()
     assert code == 0, err
     assert recorder.stop() == 0

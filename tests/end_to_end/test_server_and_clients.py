@@ -24,11 +24,11 @@ import msgpack
 import numpy as np
 import pytest
 
-from palpate.model import save_model
-from palpate_server.replay import read_session
-from palpate_server.round_trips import free_endpoint
-from palpate_server.safety import Flags
-from palpate_server.sample_model import spring_mass_model
+from palpate.model_file import save_model
+from palpate_server.diagnostics.round_trips import free_endpoint
+from palpate_server.diagnostics.sample_model import spring_mass_model
+from palpate_server.realtime.safety import Flags
+from palpate_server.recording.replay import read_session
 
 LIMITS_MET = int(
     Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED | Flags.SLEW_LIMITED | Flags.FORCE_CLAMPED | Flags.FAULT
@@ -577,7 +577,7 @@ def test_metrics_of_a_running_server_are_served_to_prometheus(
     served = serve()
     port = free_endpoint().rpartition(":")[2]
     options = ("--connect", served.endpoint, "--session", "test", "--port", port)
-    start("-m", "palpate_server.metrics", *options, ready="metrics of")
+    start("-m", "palpate_server.diagnostics.metrics", *options, ready="metrics of")
 
     def scrape() -> str:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60) as reply:

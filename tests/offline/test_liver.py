@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate import config as config_tables
 from palpate.build import build_cloud
-from palpate.config import load_config
 from palpate.discretization.statics import static_stiffness
 from palpate.geometry.regions import PlaneRegion, contact_patch, nodes_in
+from palpate.scene import schema as config_tables
+from palpate.scene.schema import load_config
 
 LIVER = Path(__file__).parents[2] / "configs" / "liver.toml"
 

@@ -16,11 +16,12 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.model import ReducedModel
-from palpate_server import transport, wire
-from palpate_server.recorder import Recorder
-from palpate_server.safety import Flags, Limits
-from palpate_server.service import Service
+from palpate.model_file import ReducedModel
+from palpate_server import wire
+from palpate_server.realtime.safety import Flags, Limits
+from palpate_server.recording.recorder import Recorder
+from palpate_server.session import transport
+from palpate_server.session.state import Service
 
 PAGE = Path(__file__).parents[2] / "docs" / "wire.md"
 GOOD = {"sequence": 3, "client_time_ns": 5, "displacement_m": {"tip": [0.0, 1e-3, -2]}}

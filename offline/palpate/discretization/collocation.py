@@ -17,9 +17,9 @@ from scipy.sparse import block_array, csr_array, diags_array, kron, vstack
 from palpate.discretization.nodal import NodalValues, nodal_shape_functions
 from palpate.discretization.supports import Supports, components, supports
 from palpate.geometry.cloud import NodeCloud
-from palpate.material import Material
-from palpate.system import ElasticModes
-from palpate.time_integration import EquationsOfMotion
+from palpate.modes.elastic_modes import ElasticModes
+from palpate.scene.material import Material
+from palpate_paper.time_integration import EquationsOfMotion
 
 SUPPORT_RADIUS_FACTOR = 2.2
 """Support radius over node spacing: the paper's cube is stable here and not at 2.0, 2.4 or 2.6 for some layouts."""

@@ -21,10 +21,10 @@ from palpate.discretization.consistency import consistent_gradient, vector_areas
 from palpate.discretization.nodal import NodalValues, nodal_shape_functions
 from palpate.discretization.supports import Supports, components, supports
 from palpate.geometry.cloud import NodeCloud
-from palpate.material import Material
 from palpate.meshfree import ShapeFunctions
-from palpate.system import ElasticModes
-from palpate.time_integration import EquationsOfMotion, with_multipliers
+from palpate.modes.elastic_modes import ElasticModes
+from palpate.scene.material import Material
+from palpate_paper.time_integration import EquationsOfMotion, with_multipliers
 
 SUPPORT_RADIUS_FACTOR = 2.2
 """Support radius over node spacing. On the unit cube 1.8 is a little better on lattices and 2.6 worse on scattered nodes."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from palpate.geometry.cloud import NodeCloud
-from palpate.material import Material
+from palpate.scene.material import Material
 
 NODES_A_WAVELENGTH = 6
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.material import PronySeries
-from palpate.system import ElasticModes
+from palpate.modes.elastic_modes import ElasticModes
+from palpate.scene.material import PronySeries
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 from palpate.discretization.conservative import SUPPORT_RADIUS_FACTOR, sparse_gradient
 from palpate.discretization.supports import supports
 from palpate.geometry.cloud import NodeCloud
-from palpate.material import Material
+from palpate.scene.material import Material
 
 Array = NDArray[np.float64]
 

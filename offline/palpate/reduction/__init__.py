@@ -1,11 +1,11 @@
 """Reductions of linear systems, of viscoelastic bodies above all, and the evidence for them."""
 
-from palpate.reduction.errors import ReductionError
+from palpate.lti.errors import ReductionError
+from palpate.lti.sampling import discretise
 from palpate.reduction.evidence import measure
 from palpate.reduction.hankel_optimal import hankel_optimal
 from palpate.reduction.linear_system import LinearSystem
 from palpate.reduction.methods import METHODS, Method, Reduction, reduce
-from palpate.reduction.sampling import discretise
 from palpate.reduction.surface import SurfaceOutput, fit_surface_output
 from palpate.reduction.truncation import (
     ReducedSystem,

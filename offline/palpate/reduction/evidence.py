@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.diagonal_system import DiagonalSystem
-from palpate.model import Evidence, StateSpace
-from palpate.reduction.block_form import from_block_form
-from palpate.reduction.frequencies import (
+from palpate.lti.block_form import from_block_form
+from palpate.lti.frequencies import (
     all_frequencies,
     band_frequencies,
     maximum,
     relative_errors,
     spectral_norms,
 )
+from palpate.lti.pole_residue import DiagonalSystem
+from palpate.model_file import Evidence, StateSpace
 from palpate.reduction.methods import Reduction
 from palpate.reduction.passivity import largest_energy_out, passive_up_to, passivity_margin
 
@@ -33,7 +33,7 @@ def measure(
     error_surface_in_band: float,
     resolved_frequency_hz: float,
 ) -> Evidence:
-    """All the evidence that goes with a model; `palpate.model.Evidence` defines each figure.
+    """All the evidence that goes with a model; `palpate.model_file.Evidence` defines each figure.
 
     discrete  the reduction's state space discretised at period_s
     The surface error and the resolved frequency are passed on.

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.diagonal_system import DiagonalSystem
+from palpate.lti.pole_residue import DiagonalSystem
 from palpate.reduction.balancing import Gramians, missing_in_sum
 
 Array = NDArray[np.float64]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.lti.errors import ReductionError
 from palpate.reduction.balancing import balance
-from palpate.reduction.errors import ReductionError
 from palpate.reduction.linear_system import LinearSystem, split
 from palpate.reduction.truncation import ReducedSystem, System, Unstable, prepare
 

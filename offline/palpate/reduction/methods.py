@@ -10,12 +10,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.diagonal_system import DiagonalSystem
-from palpate.model import StateSpace
+from palpate.lti.block_form import diagonalise, to_block_form
+from palpate.lti.errors import ReductionError as ReductionError
+from palpate.lti.frequencies import band_frequencies, relative_errors
+from palpate.lti.pole_residue import DiagonalSystem
+from palpate.model_file import StateSpace
 from palpate.reduction.balancing import Balancing, Gramians, balance
-from palpate.reduction.block_form import diagonalise, to_block_form
-from palpate.reduction.errors import ReductionError as ReductionError
-from palpate.reduction.frequencies import band_frequencies, relative_errors
 from palpate.reduction.gramians import band_controllability_factor, gramians, real_form
 from palpate.reduction.search import smallest_order
 

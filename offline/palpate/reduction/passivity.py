@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.diagonal_system import DiagonalSystem
-from palpate.reduction.frequencies import maximum, spectral_norms
+from palpate.lti.frequencies import maximum, spectral_norms
+from palpate.lti.pole_residue import DiagonalSystem
 
 Array = NDArray[np.float64]
 

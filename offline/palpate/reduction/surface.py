@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.material import PronySeries
-from palpate.model import StateSpace
-from palpate.system import ElasticModes
+from palpate.model_file import StateSpace
+from palpate.modes.elastic_modes import ElasticModes
+from palpate.scene.material import PronySeries
 
 Array = NDArray[np.float64]
 

@@ -20,11 +20,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.diagonal_system import DiagonalSystem
+from palpate.lti.block_form import diagonalise
+from palpate.lti.errors import ReductionError
+from palpate.lti.frequencies import frequencies_near, relative_errors, spectral_norms
+from palpate.lti.pole_residue import DiagonalSystem
 from palpate.reduction.balancing import Balancing, Gramians, Realisation, balance
-from palpate.reduction.block_form import diagonalise
-from palpate.reduction.errors import ReductionError
-from palpate.reduction.frequencies import frequencies_near, relative_errors, spectral_norms
 from palpate.reduction.gramians import (
     band_controllability_factor,
     band_quadrature,

@@ -1,0 +1,1 @@
+"""Linear time-invariant systems in pole-residue form."""

@@ -1,0 +1,75 @@
+"""Where to sample frequency responses, and relative errors between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.lti.pole_residue import DiagonalSystem
+
+Array = NDArray[np.float64]
+
+
+def band_frequencies(systems: tuple[DiagonalSystem, ...], band_hz: tuple[float, float]) -> Array:
+    """`frequencies_near` the poles of all the systems."""
+    return frequencies_near(np.concatenate([s.poles for s in systems]), band_hz)
+
+
+def frequencies_near(poles: NDArray[np.complex128], band_hz: tuple[float, float]) -> Array:
+    """(n,), rad/s, ascending: both ends of the band, 400 points even in log frequency, and the resonances inside."""
+    low, high = 2 * np.pi * band_hz[0], 2 * np.pi * band_hz[1]
+    slowest = float(np.min(np.abs(poles), initial=high))
+    start = max(low, min(slowest / 100, high / 1000))
+    omega = np.concatenate([[low, high], np.geomspace(start, high, 400), poles.imag[poles.imag > 0]])
+    return np.unique(omega[(omega >= low) & (omega <= high)])
+
+
+def all_frequencies(systems: tuple[DiagonalSystem, ...]) -> Array:
+    """(n,), rad/s, ascending: 0, 600 points even in log frequency across all poles, and every resonance."""
+    magnitudes = np.concatenate([np.abs(s.poles) for s in systems])
+    resonances = np.concatenate([s.poles.imag[s.is_pair] for s in systems])
+    slowest, fastest = (
+        float(np.min(magnitudes, initial=np.inf)),
+        float(np.max(magnitudes, initial=0.0)),
+    )
+    if fastest == 0:
+        return np.zeros(1)
+    grid = np.geomspace(slowest / 100, fastest * 100, 600)
+    return np.unique(np.concatenate([[0.0], grid, resonances]))
+
+
+def spectral_norms(matrices: NDArray[np.complex128] | Array) -> Array:
+    """(n,): largest singular value of each of the matrices (n, p, m)."""
+    return np.linalg.norm(matrices, ord=2, axis=(1, 2))
+
+
+def maximum(function: Callable[[Array], Array], omega: Array, n_peaks: int = 12) -> tuple[float, float]:
+    """(omega, value) of the largest value of function, sampled at omega and refined around its highest local maxima.
+
+    function  maps frequencies (n,) to values (n,)
+    """
+    values = function(omega)
+    padded = np.concatenate([[-np.inf], values, [-np.inf]])
+    local = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]))
+    highest = local[np.argsort(values[local])[::-1][:n_peaks]]
+    best = int(highest[0])
+    best_omega, best_value = float(omega[best]), float(values[best])
+    left = omega[np.maximum(highest - 1, 0)]
+    right = omega[np.minimum(highest + 1, len(omega) - 1)]
+    for _ in range(3):
+        points = np.linspace(left, right, 17, axis=1)
+        values = function(points.ravel()).reshape(points.shape)
+        top = np.argmax(values, axis=1)
+        rows = np.arange(len(points))
+        leader = int(np.argmax(values[rows, top]))
+        if values[leader, top[leader]] > best_value:
+            best_omega, best_value = float(points[leader, top[leader]]), float(values[leader, top[leader]])
+        left, right = points[rows, np.maximum(top - 1, 0)], points[rows, np.minimum(top + 1, 16)]
+    return best_omega, best_value
+
+
+def relative_errors(full: NDArray[np.complex128] | Array, other: NDArray[np.complex128] | Array) -> Array:
+    """(n,): |full - other| / |full|, 2-norms, of responses (n, n_outputs, n_inputs) at the same frequencies."""
+    return spectral_norms(full - other) / spectral_norms(full)

@@ -1,0 +1,1 @@
+"""Elastic modes of a supported body."""

@@ -1,0 +1,326 @@
+"""Scene files: what a TOML configuration may say, checked before anything is computed."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from palpate.model_file import LONGEST_PERIOD_S, SHORTEST_PERIOD_S
+from palpate.scene.material import PRESETS, Material, PronySeries
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
+Count = Annotated[int, Field(strict=True)]
+Point = tuple[Number, Number, Number]
+ReductionMethod = Literal["tbr", "tbr-band", "modal", "modal-static"]
+
+
+MAX_NODES = 100_000
+"""More than this is a slip in a unit: all modes of a tenth of it do not fit into any memory."""
+
+_SHORTEST_TAU_IN_PERIODS = 0.01
+"""A relaxation so much faster than the sampling is a damper, not a branch, and drowns in round-off."""
+
+
+class ConfigError(ValueError):
+    """A configuration says something that can't be built; the message names the key, the value and what is allowed."""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class BoxGeometry(_Table):
+    """A box of lattice nodes, faces included."""
+
+    shape: Literal["box"]
+    lower_m: Point = (0.0, 0.0, 0.0)
+    upper_m: Point
+    counts: tuple[Count, Count, Count] = Field(description="nodes along x, y, z, each at least 3")
+    jitter: Number = Field(default=0.0, ge=0, le=0.4, description="random shift as a fraction of the spacing")
+    seed: Count = Field(default=0, ge=0)
+
+    @model_validator(mode="after")
+    def _is_a_box(self) -> BoxGeometry:
+        if any(u <= low for low, u in zip(self.lower_m, self.upper_m, strict=True)):
+            raise ValueError(f"upper_m = {list(self.upper_m)}: expected above lower_m = {list(self.lower_m)}")
+        if min(self.counts) < 3:
+            raise ValueError(f"counts = {list(self.counts)}: expected at least 3 along each axis")
+        if math.prod(self.counts) > MAX_NODES:
+            raise ValueError(f"counts = {list(self.counts)}: expected at most {MAX_NODES:,} nodes in all")
+        return self
+
+
+class BallGeometry(_Table):
+    """A ball about the origin."""
+
+    shape: Literal["ball"]
+    radius_m: Positive
+    spacing_m: Positive
+
+    @model_validator(mode="after")
+    def _is_of_a_size(self) -> BallGeometry:
+        nodes = 4 / 3 * math.pi * (self.radius_m / self.spacing_m) ** 3
+        if not 8 <= nodes <= MAX_NODES:
+            raise ValueError(
+                f"spacing_m = {self.spacing_m:g} in a ball of radius_m = {self.radius_m:g} makes about {nodes:.3g} nodes: "
+                f"expected from 8 to {MAX_NODES:,}"
+            )
+        return self
+
+
+class SurfaceGeometry(_Table):
+    """The inside of a closed triangle surface."""
+
+    shape: Literal["surface"]
+    file: str = Field(description="STL, OBJ or PLY, relative to the configuration")
+    file_unit: Literal["m", "cm", "mm"] = "m"
+    spacing_m: Positive
+    growth: Number = Field(
+        default=0.3, gt=0, le=0.5, description="growth of the spacing per metre away from a refined contact"
+    )
+
+
+class BoxRegion(_Table):
+    """Boundary nodes inside an axis-aligned box."""
+
+    region: Literal["box"]
+    lower_m: Point
+    upper_m: Point
+
+
+class PlaneRegion(_Table):
+    """Boundary nodes on the side of a plane that its normal points to."""
+
+    region: Literal["plane"]
+    point_m: Point
+    normal: Point
+
+
+class SphereRegion(_Table):
+    """Boundary nodes inside a sphere."""
+
+    region: Literal["sphere"]
+    center_m: Point
+    radius_m: Positive
+
+
+class NearestRegion(_Table):
+    """The boundary node nearest to a point."""
+
+    region: Literal["nearest"]
+    point_m: Point
+
+
+class ContactTable(_Table):
+    """A patch of the surface that a tool tip holds and moves as one rigid piece."""
+
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,31}$")
+    point_m: Point = Field(description="the patch is centred at the surface point nearest to this")
+    radius_m: Positive
+    spacing_m: Positive | None = Field(
+        default=None, description="node spacing on the patch; unset: unrefined"
+    )
+
+
+class MaterialTable(_Table):
+    """A preset by name, with any of its constants replaced; or all constants."""
+
+    preset: str | None = None
+    youngs_modulus_pa: Positive | None = None
+    poissons_ratio: Number | None = Field(default=None, gt=-1, lt=0.5)
+    density_kg_per_m3: Positive | None = None
+    gamma: tuple[Positive, ...] | None = None
+    tau_s: tuple[Positive, ...] | None = None
+
+    @model_validator(mode="after")
+    def _can_be_made(self) -> MaterialTable:
+        self.material()
+        return self
+
+    def material(self) -> Material:
+        """The material itself. Raises ValueError naming what is missing or unknown."""
+        if self.preset is not None and self.preset not in PRESETS:
+            raise ValueError(f"preset = {self.preset!r}: expected one of {', '.join(sorted(PRESETS))}")
+        base = PRESETS[self.preset] if self.preset is not None else None
+        names = ("youngs_modulus_pa", "poissons_ratio", "density_kg_per_m3")
+        values = {n: getattr(self, n) for n in names}
+        if base is not None:
+            values = {n: getattr(base, n) if v is None else v for n, v in values.items()}
+        missing = [n for n, v in values.items() if v is None]
+        if missing:
+            raise ValueError(f"{', '.join(missing)} missing: give all constants, or a preset")
+        if (self.gamma is None) != (self.tau_s is None):
+            raise ValueError("gamma and tau_s belong together: give both or neither")
+        if self.gamma is not None and self.tau_s is not None:
+            prony = PronySeries(self.gamma, self.tau_s)
+        else:
+            prony = base.prony if base is not None else PronySeries()
+        return Material(**values, prony=prony)
+
+
+class DiscretizationTable(_Table):
+    """`conservative` (symmetric, passive; the default) or the paper's `collocation`."""
+
+    method: Literal["conservative", "collocation"] = "conservative"
+    support_radius: Number = Field(
+        default=2.2, ge=1.2, le=4.0, description="support radius over node spacing"
+    )
+
+
+class ReductionTable(_Table):
+    """How the full model is reduced and sampled."""
+
+    method: ReductionMethod = "tbr-band"
+    order: Count | None = Field(default=None, ge=2, description="number of states")
+    tolerance: float | None = Field(
+        default=None, gt=0, lt=1, description="largest relative in-band force error"
+    )
+    band_hz: tuple[Number, Number] = (0.0, 30.0)
+    period_s: Number = Field(default=1e-3, ge=SHORTEST_PERIOD_S, le=LONGEST_PERIOD_S)
+    sampling: Literal["bilinear", "first-order-hold"] = "bilinear"
+
+    @model_validator(mode="after")
+    def _one_stop(self) -> ReductionTable:
+        if (self.order is None) == (self.tolerance is None):
+            raise ValueError(
+                f"order = {self.order} and tolerance = {self.tolerance}: expected exactly one of them"
+            )
+        low, high = self.band_hz
+        if not 0 <= low < high < 0.5 / self.period_s:
+            raise ValueError(
+                f"band_hz = {list(self.band_hz)}: expected 0 <= low < high < {0.5 / self.period_s:g} Hz, "
+                "half the sampling rate"
+            )
+        return self
+
+
+class Config(_Table):
+    """A whole scene."""
+
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")
+    geometry: Annotated[BoxGeometry | BallGeometry | SurfaceGeometry, Field(discriminator="shape")]
+    material: MaterialTable
+    fixed: tuple[
+        Annotated[BoxRegion | PlaneRegion | SphereRegion | NearestRegion, Field(discriminator="region")], ...
+    ] = Field(min_length=1)
+    contact: tuple[ContactTable, ...] = Field(min_length=1)
+    discretization: DiscretizationTable = DiscretizationTable()
+    reduction: ReductionTable = ReductionTable(tolerance=0.02)
+
+    @model_validator(mode="after")
+    def _contacts_can_be_told_apart(self) -> Config:
+        names = [c.name for c in self.contact]
+        if len(set(names)) < len(names):
+            raise ValueError(f"contact names {names}: expected each name once")
+        if not isinstance(self.geometry, SurfaceGeometry):
+            for contact in self.contact:
+                if contact.spacing_m is not None:
+                    raise ValueError(
+                        f"contact {contact.name!r} has spacing_m, but a {self.geometry.shape} is a uniform cloud: "
+                        "only a surface can be refined around a contact"
+                    )
+        shortest = _SHORTEST_TAU_IN_PERIODS * self.reduction.period_s
+        too_short = [tau for tau in self.material.material().prony.tau_s if tau < shortest]
+        if too_short:
+            raise ValueError(
+                f"material.tau_s holds {too_short[0]:g}: expected at least {shortest:g} s, "
+                f"{_SHORTEST_TAU_IN_PERIODS:g} of reduction.period_s"
+            )
+        return self
+
+
+def load_config(path: Path) -> Config:
+    """Read a scene.
+
+    Raises FileNotFoundError, or ConfigError with one line per mistake.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such configuration")
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    return check_config(tables, str(path))
+
+
+def check_config(tables: dict[str, Any], origin: str) -> Config:
+    """The configuration that parsed TOML tables describe. Raises ConfigError; `origin` opens its message."""
+    try:
+        return Config.model_validate(tables)
+    except ValidationError as error:
+        mistakes = error.errors()
+        # A list whose entries are wrong is also told to be too short: that follows, and helps nobody.
+        entries = {e["loc"][0] for e in mistakes if len(e["loc"]) > 1}
+        told = [e for e in mistakes if not (e["type"] == "too_short" and e["loc"][0] in entries)]
+        raise ConfigError("\n".join(f"{origin}: {_line(e)}" for e in told)) from error
+
+
+def override_reduction(
+    config: Config, method: str | None, order: int | None, tolerance: float | None, origin: str
+) -> Config:
+    """The configuration with parts of its reduction replaced, checked again; order and tolerance displace each other."""
+    tables = config.model_dump(mode="json", exclude_none=True)
+    reduction = tables["reduction"]
+    if method is not None:
+        reduction["method"] = method
+    if order is not None or tolerance is not None:
+        reduction.pop("order", None)
+        reduction.pop("tolerance", None)
+        reduction |= {k: v for k, v in (("order", order), ("tolerance", tolerance)) if v is not None}
+    return check_config(tables, origin)
+
+
+def canonical_text(config: Config) -> str:
+    """The configuration as JSON with all defaults filled in: what a model file records."""
+    return config.model_dump_json(exclude_none=True)
+
+
+def fingerprint(config: Config, folder: Path) -> str:
+    """SHA-256 of `canonical_text` followed by the surface file's bytes, hexadecimal.
+
+    Raises FileNotFoundError when the surface, relative to `folder`, is not there.
+    """
+    digest = hashlib.sha256(canonical_text(config).encode())
+    if isinstance(config.geometry, SurfaceGeometry):
+        surface = folder / config.geometry.file
+        if not surface.is_file():
+            raise FileNotFoundError(f"geometry.file = {config.geometry.file!r}: no such file as {surface}")
+        digest.update(surface.read_bytes())
+    return digest.hexdigest()
+
+
+_DISCRIMINATORS = {"box", "ball", "surface", "plane", "sphere", "nearest"}
+
+
+def _line(error: Any) -> str:
+    parts = [p for p in error["loc"] if p not in _DISCRIMINATORS]
+    key = ""
+    for part in parts:
+        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
+    key = key or "configuration"
+    value = error["input"]
+    message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "tuple_type" and len(parts) == 1 and parts[0] in ("fixed", "contact"):
+        return f"{key}: expected a list of tables, [[{key}]]"
+    if error["type"] == "missing":
+        return f"{key}: missing, it is required"
+    if error["type"] == "extra_forbidden":
+        return f"{key}: unknown key; remove it or check its spelling"
+    if error["type"] in ("union_tag_invalid", "union_tag_not_found"):
+        context = error["ctx"]
+        tag = context["discriminator"].strip("'")
+        got = f" = {context['tag']!r}" if "tag" in context else ""
+        allowed = context.get("expected_tags")
+        if allowed is None:
+            allowed = "'box', 'plane', 'sphere', 'nearest'" if tag == "region" else "'box', 'ball', 'surface'"
+            return f"{key}.{tag}: missing, expected one of {allowed}"
+        return f"{key}.{tag}{got}: expected one of {allowed}"
+    if isinstance(value, dict | list) and error["type"] == "value_error":
+        return f"{key}: {message}"
+    return f"{key} = {value!r}: {message[0].lower() + message[1:]}"

@@ -1,0 +1,1 @@
+"""Bodies: a state, one step, the surface read-out."""

@@ -1,0 +1,1 @@
+"""Host checks, round trips, metrics and the simulated device."""

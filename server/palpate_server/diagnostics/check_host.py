@@ -1,0 +1,271 @@
+"""Is this machine fit to serve forces to a hand? Measures what counts, gives a verdict, and says what to change.
+
+    palpate check-host [--seconds 10] [--json]
+
+Exit code 0: good or marginal. 1: not sufficient. 2: it could not be measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from palpate.model_file import save_model
+from palpate_server.arguments import positive
+from palpate_server.diagnostics.round_trips import RoundTrips, ping_pong, through_a_model
+from palpate_server.diagnostics.sample_model import spring_mass_model
+from palpate_server.realtime import scheduler, shared_memory, threads
+from palpate_server.realtime.native_image import make_image
+from palpate_server.realtime.safety import Limits
+from palpate_server.session import status, transport
+
+GOOD, MARGINAL, NOT_SUFFICIENT = "good", "marginal", "not sufficient"
+_TIMER_S = 3.0
+_LONGEST_S = 3600.0
+_COMMAND_BYTES, _FORCE_BYTES = 90, 220
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was measured: in words and as values with the unit in their names, the verdict on it, and what to
+    do when it is not good.
+    """
+
+    name: str
+    text: str
+    values: Mapping[str, float | str | bool | None]
+    verdict: str
+    advice: str = ""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """A value up to `good` is good, up to `marginal` marginal, above not sufficient."""
+
+    good: float
+    marginal: float
+
+    def judge(self, value: float) -> str:
+        if value <= self.good:
+            return GOOD
+        return MARGINAL if value <= self.marginal else NOT_SUFFICIENT
+
+
+# A hand feels what happens within a few milliseconds; a tick has one.
+TIMER_LATENESS_P99_S = Bounds(100e-6, 500e-6)
+ROUND_TRIP_P99_S = Bounds(1e-3, 3e-3)
+UNANSWERED_SHARE = Bounds(0.01, 0.1)  # of commands: lost, or replaced by a newer one before a tick
+LATE_SHARE = Bounds(0.001, 0.01)
+SKIPPED_SHARE = Bounds(0.0, 0.001)
+LOAD_PER_CPU = Bounds(0.3, 0.8)
+
+
+def worst(verdicts: Sequence[str]) -> str:
+    return max(verdicts, key=(GOOD, MARGINAL, NOT_SUFFICIENT).index)
+
+
+def settings() -> list[Finding]:
+    """What the kernel and this user's limits allow. None of it alone makes a machine insufficient."""
+    findings = []
+    cpus = len(os.sched_getaffinity(0))
+    findings.append(
+        Finding(
+            "processors",
+            str(cpus),
+            {"processors": cpus},
+            GOOD if cpus >= 2 else MARGINAL,
+            "give the server two processors",
+        )
+    )
+    load = os.getloadavg()[0] / cpus
+    findings.append(
+        Finding(
+            "load per processor",
+            f"{load:.2f}",
+            {"load_per_processor": load},
+            min_marginal(LOAD_PER_CPU.judge(load)),
+            "stop other programs",
+        )
+    )
+    preempt = Path("/sys/kernel/realtime")
+    real_time = preempt.is_file() and preempt.read_text().strip() == "1"
+    findings.append(
+        Finding(
+            "real-time kernel",
+            "yes" if real_time else "no",
+            {"real_time_kernel": real_time},
+            GOOD if real_time else MARGINAL,
+            "a PREEMPT_RT kernel",
+        )
+    )
+    governor = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    if governor.is_file():
+        name = governor.read_text().strip()
+        findings.append(
+            Finding(
+                "frequency governor",
+                name,
+                {"governor": name},
+                GOOD if name == "performance" else MARGINAL,
+                "cpupower frequency-set -g performance",
+            )
+        )
+    refusal = _try_priority()
+    findings.append(
+        Finding(
+            "real-time priority",
+            refusal or "allowed",
+            {"allowed": refusal is None},
+            MARGINAL if refusal else GOOD,
+            refusal or "",
+        )
+    )
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    locked = soft == resource.RLIM_INFINITY or os.geteuid() == 0
+    findings.append(
+        Finding(
+            "locked memory",
+            "unlimited" if locked else f"{soft} bytes",
+            {"allowed_bytes": None if locked else soft},
+            GOOD if locked else MARGINAL,
+            "ulimit -l unlimited",
+        )
+    )
+    return findings
+
+
+def min_marginal(verdict: str) -> str:
+    """A setting is a hint; the verdict comes from what is measured."""
+    return MARGINAL if verdict == NOT_SUFFICIENT else verdict
+
+
+def _try_priority() -> str | None:
+    result: list[str | None] = []
+    thread = threading.Thread(target=lambda: result.append(threads.raise_priority()))
+    thread.start()
+    thread.join()
+    return result[0]
+
+
+def timer(seconds: float = _TIMER_S) -> Finding:
+    """Lateness of the deadline loop alone."""
+    model = spring_mass_model(n_modes=2)
+    memory = shared_memory.make_memory(model.discrete, model.period_s, [Limits(1.0, 1.0, 1.0, 1.0, 0.0)], 1.0)
+    image = make_image(memory)
+    scheduler.stop(memory.shared)
+    wake = os.eventfd(0)
+    scheduler.run_at_deadlines(image, wake)  # compiled
+    memory.shared[shared_memory.STOP] = 0
+    memory.shared[shared_memory.DEADLINE_NS] = time.monotonic_ns()
+
+    def run() -> None:
+        threads.raise_priority()
+        scheduler.run_at_deadlines(image, wake)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        time.sleep(seconds)
+    finally:
+        scheduler.stop(memory.shared)
+        thread.join()
+        os.close(wake)
+    lateness = status.percentiles(
+        memory.histograms[shared_memory.TIMER_LATENESS], int(memory.longest_ns[shared_memory.TIMER_LATENESS])
+    )
+    p50, p99 = lateness["p50"], lateness["p99"]
+    assert p50 is not None
+    assert p99 is not None
+    return Finding(
+        "timer lateness",
+        f"p50 {p50 * 1e6:.0f} us, p99 {p99 * 1e6:.0f} us",
+        {"p50_s": p50, "p99_s": p99},
+        TIMER_LATENESS_P99_S.judge(p99),
+        "allow real-time priority, use a real-time kernel, stop other programs",
+    )
+
+
+def transport_round_trip(seconds: float = _TIMER_S) -> list[Finding]:
+    trips = ping_pong(_COMMAND_BYTES, _FORCE_BYTES, seconds)
+    advice = "stop other programs; check what else uses the loopback device"
+    return [_duration("Zenoh round trip", trips, advice), _unanswered("unanswered pings", trips, advice)]
+
+
+def tick_run(seconds: float) -> list[Finding]:
+    """A real server, a client at 1 kHz and a surface viewer."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "sample.npz"
+        save_model(spring_mass_model(n_modes=50), path)
+        trips, status = through_a_model(path, "tip", seconds, viewer=True)
+    late = status["late_ticks"] / max(status["ticks"], 1)
+    skipped = status["skipped_ticks"] / max(status["ticks"], 1)
+    return [
+        _duration("command to force", trips, "see timer and round trip"),
+        _unanswered("unanswered commands", trips, "see timer and round trip"),
+        _share("late ticks", late, LATE_SHARE, "allow real-time priority"),
+        _share("skipped ticks", skipped, SKIPPED_SHARE, "stop other programs"),
+    ]
+
+
+def _duration(name: str, trips: RoundTrips, advice: str) -> Finding:
+    text = f"p50 {trips.p50_s * 1e6:.0f} us, p99 {trips.p99_s * 1e6:.0f} us"
+    values = {"p50_s": trips.p50_s, "p99_s": trips.p99_s}
+    return Finding(name, text, values, ROUND_TRIP_P99_S.judge(trips.p99_s), advice)
+
+
+def _unanswered(name: str, trips: RoundTrips, advice: str) -> Finding:
+    return _share(name, trips.unanswered, UNANSWERED_SHARE, advice)
+
+
+def _share(name: str, share: float, bounds: Bounds, advice: str) -> Finding:
+    return Finding(name, f"{share:.3%}", {"share": share}, bounds.judge(share), advice)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="palpate check-host", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument(
+        "--seconds", type=_seconds, default=10.0, help="length of the tick run, up to an hour (%(default)s s)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+    options = parser.parse_args(arguments)
+    hints = settings()
+    try:
+        measured = [timer(), *transport_round_trip(), *tick_run(options.seconds)]
+    except transport.TransportError as error:
+        print(f"palpate check-host: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 2
+    verdict = worst([finding.verdict for finding in measured])
+    if options.json:
+        print(
+            json.dumps({"verdict": verdict, "findings": [asdict(f) for f in (*hints, *measured)]}, indent=2)
+        )
+    else:
+        for finding in (*hints, *measured):
+            print(f"{finding.name:20} {finding.verdict:15} {finding.text}")
+        print(f"\nverdict: {verdict}")
+        for finding in (*hints, *measured):
+            if finding.verdict != GOOD:
+                print(f"  {finding.name}: {finding.advice}")
+    return 1 if verdict == NOT_SUFFICIENT else 0
+
+
+def _seconds(text: str) -> float:
+    value = positive(text)
+    if value > _LONGEST_S:
+        raise argparse.ArgumentTypeError(f"{text!r} is more than {_LONGEST_S:.0f}")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

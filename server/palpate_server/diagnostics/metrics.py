@@ -1,0 +1,123 @@
+"""A Prometheus endpoint for a running server, in a process of its own so that no scrape can stall the loop.
+
+python -m palpate_server.diagnostics.metrics [--connect ENDPOINT] [--session NAME] [--port 9464]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgpack
+
+from palpate_server import wire
+from palpate_server.arguments import need, port
+from palpate_server.session import transport
+
+if __name__ == "__main__":
+    need("prometheus_client", "metrics", "palpate_server.diagnostics.metrics")
+
+from prometheus_client import REGISTRY, start_http_server
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.metrics_core import Metric
+from prometheus_client.registry import Collector
+
+_COUNTERS = {
+    "ticks": "model steps",
+    "ticks_on_arrival": "ticks that a command triggered",
+    "late_ticks": "ticks that began more than a quarter of a period late",
+    "caught_up_ticks": "missed ticks that were made up for",
+    "skipped_ticks": "missed ticks that were not",
+    "faults": "forces that were not finite",
+    "lost_clients": "clients that were gone without releasing what they held",
+    "accepted": "commands carried out",
+}
+_DURATIONS = ("timer_lateness_s", "tick_lateness_s", "compute_time_s", "input_age_s")
+_RATES = {
+    "success_rate": "share of the last 100 ticks with a new command in time",
+    "success_rate_since_start": "share of the ticks with a client that had a new command in time",
+}
+
+
+class StatusCollector(Collector):
+    """Turns the newest status message into metrics when it is asked."""
+
+    def __init__(self) -> None:
+        self.status: dict[str, Any] | None = None
+
+    def collect(self) -> Iterator[Metric]:
+        status = self.status
+        yield GaugeMetricFamily(
+            "palpate_up", "1 while the server sends its status", value=float(status is not None)
+        )
+        if status is None:
+            return
+        for name, text in _COUNTERS.items():
+            yield CounterMetricFamily(f"palpate_{name}", text, value=status[name])
+        for kind, what in (
+            ("refused", "commands"),
+            ("malformed", "commands"),
+            ("dropped", "commands and forces"),
+        ):
+            family = CounterMetricFamily(f"palpate_{kind}", f"{what} {kind}, by reason", labels=["reason"])
+            for reason, count in status[kind].items():
+                family.add_metric([reason], count)
+            yield family
+        for name in _DURATIONS:
+            metric = f"palpate_{name.removesuffix('_s')}_seconds"
+            gauge = GaugeMetricFamily(metric, f"{name} since the start", labels=["quantile"])
+            for quantile, value in status[name].items():
+                if value is not None:
+                    gauge.add_metric([quantile], value)
+            yield gauge
+        for name, text in _RATES.items():
+            rate = GaugeMetricFamily(f"palpate_{name}", text, labels=["contact"])
+            for contact, state in status["contacts"].items():
+                if state[name] is not None:
+                    rate.add_metric([contact], state[name])
+            yield rate
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="palpate_server.diagnostics.metrics", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument(
+        "--connect", default=transport.DEFAULT_ENDPOINT, metavar="ENDPOINT", help="(%(default)s)"
+    )
+    parser.add_argument("--session", default="main", help="(%(default)s)")
+    parser.add_argument("--zenoh-config", type=Path, metavar="FILE", help="used instead of --connect")
+    parser.add_argument("--address", default="127.0.0.1", help="to listen on (%(default)s)")
+    parser.add_argument("--port", type=port, default=9464, help="to listen on (%(default)s)")
+    options = parser.parse_args(arguments)
+    collector = StatusCollector()
+    try:
+        keys = wire.Keys(options.session)
+        with transport.connect_session(options.connect, options.zenoh_config) as session:
+            heard = threading.Event()
+
+            def on_status(sample: Any) -> None:
+                collector.status = msgpack.unpackb(sample.payload.to_bytes())
+                heard.set()
+
+            session.declare_subscriber(keys.status, on_status)  # for as long as the session
+            REGISTRY.register(collector)
+            start_http_server(options.port, options.address)
+            print(f"metrics of {keys.prefix} on http://{options.address}:{options.port}/metrics", flush=True)
+            while True:  # until Ctrl-C
+                if not heard.wait(1.0):
+                    collector.status = None  # what was true is no longer known
+                heard.clear()
+    except KeyboardInterrupt:
+        return 0
+    except (OSError, ValueError, transport.TransportError) as error:
+        print(f"palpate_server.diagnostics.metrics: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,71 @@
+"""How functions of the real-time path are compiled: cached on disk where that is possible, with and without the GIL."""
+
+# mypy: disable-error-code="no-untyped-call"
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from numba import njit
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def compiled(function: Function) -> Function:
+    """Compile `function`, every operation as written; Python calls it with the GIL held, so use it for microseconds.
+
+    Nothing is compiled with `fastmath`: how sums are then reordered differs between two compilations of the same code, and a
+    replay would not be exact. And a test for NaN on such sums is optimised away.
+    """
+    return _compile(function, nogil=False)
+
+
+def compiled_without_gil(function: Function) -> Function:
+    """Compile `function`; it releases the GIL for as long as it runs."""
+    return _compile(function, nogil=True)
+
+
+class _Cache(FunctionCache):
+    """numba's cache on disk, under names that change as soon as any file of the server does.
+
+    numba looks at the function's own file alone, though what it stores has the functions of other files in it. And it
+    reads what is out of date before it finds that out, which fails where a type has moved: so not the stamp, the name.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        digest = _package_digest()
+        name = f"{self._impl.filename_base}-{digest[:16]}"
+        self._cache_file = IndexDataCacheFile(self.cache_path, name, digest)
+
+
+@cache
+def _package_digest() -> str:
+    """The hash of all names and contents of the server's source files."""
+    digest = hashlib.sha256()
+    folder = Path(__file__).parents[1]
+    for path in sorted(folder.rglob("*.py")):
+        source = path.read_bytes()
+        digest.update(f"{path.relative_to(folder)} {len(source)}\n".encode() + source)
+    return digest.hexdigest()
+
+
+def _compile(function: Function, *, nogil: bool) -> Function:
+    dispatcher: Any = njit(nogil=nogil)(function)
+    try:
+        dispatcher._cache = _Cache(function)
+    except (
+        RuntimeError
+    ) as error:  # no cache directory is writable: a read-only container, another user's files
+        warnings.warn(
+            f"compiled functions are not cached, every start takes seconds longer ({error}); "
+            "point NUMBA_CACHE_DIR to a writable directory",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    return cast(Function, dispatcher)

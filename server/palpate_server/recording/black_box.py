@@ -1,0 +1,133 @@
+"""The last two seconds of ticks, written to a file when something went wrong in them."""
+
+from __future__ import annotations
+
+import io
+import logging
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from palpate.files import write_whole
+from palpate_server.realtime import scheduler, shared_memory
+from palpate_server.realtime.safety import Flags
+
+log = logging.getLogger("palpate_server")
+
+KEPT_TICKS = 2000
+STORM_TICKS = 1000  # in so many ticks,
+STORM_SHARE = 0.5  # so large a share with a limit met is a storm
+MOST_FILES = 100  # of a server, however long it runs
+QUIET_S = 10.0  # between two files of one cause
+
+_LIMITED = int(
+    Flags.WORKSPACE_CLAMPED
+    | Flags.SPEED_LIMITED
+    | Flags.SLEW_LIMITED
+    | Flags.FORCE_CLAMPED
+    | Flags.PASSIVITY_LIMITED
+)
+
+
+class BlackBox:
+    """Looks at new ticks each time `examine` is called (some times a second) and writes a file when there is cause.
+
+    Causes: `fault` (a force that was not finite), `stale` (a client that holds a contact fell silent, and its force had to
+    fade to zero), `lost` (a client that held a contact was killed or cut off), `limits` (half of the last second's ticks met a limit). One file of each cause in QUIET_S; the writing is done by a thread of its own.
+    """
+
+    def __init__(
+        self, folder: Path, session: str, contacts: Sequence[str], memory: shared_memory.Memory
+    ) -> None:
+        self.folder = folder
+        self.session = session
+        self.contacts = list(contacts)
+        self.memory = memory
+        self._seen = 0
+        self._lost_clients = self._lost_written = 0
+        self._files = 0
+        self._last_file_s: dict[str, float] = {}
+
+    def examine(self, lost_clients: int = 0) -> threading.Thread | None:
+        """The thread that writes a file, when there was cause for one. `lost_clients`: how many so far."""
+        head = int(scheduler.records_written(self.memory.shared))
+        first = max(self._seen, head - shared_memory.RECORDS // 2, 0)
+        cause = self._cause(first, head, lost_clients)
+        self._seen = head
+        now = time.monotonic()
+        if (
+            cause is None
+            or now - self._last_file_s.get(cause, -np.inf) < QUIET_S
+            or self._files == MOST_FILES
+        ):
+            return None
+        self._files += 1
+        if self._files == MOST_FILES:
+            log.warning("black box: %d files, no more are written until the next start", MOST_FILES)
+        self._last_file_s[cause] = now
+        thread = threading.Thread(target=self._write, args=(cause, head), name="black box", daemon=True)
+        thread.start()
+        return thread
+
+    def _cause(self, first: int, head: int, lost_clients: int) -> str | None:
+        flags = self._flags(first, head)
+        if np.any(flags & int(Flags.FAULT)):
+            return "fault"
+        was_lost, self._lost_clients = self._lost_clients > self._lost_written, lost_clients
+        if was_lost:  # seen the last time, so that by now the fading of the force is among the ticks
+            self._lost_written = self._lost_clients
+            return "lost"
+        if first == head:
+            return None
+        before = self._flags(first - 1, head - 1) if first else np.full_like(flags, int(Flags.STALE))
+        became_stale = (flags & int(Flags.STALE) > 0) & (before & int(Flags.DECAYING) > 0)
+        if np.any(
+            became_stale & (self._column(shared_memory.SEQUENCE, first, head) >= 0)
+        ):  # not one that was released
+            return "stale"
+        recent = self._flags(max(0, head - STORM_TICKS), head)
+        if len(recent) == STORM_TICKS and np.mean(np.any(recent & _LIMITED, axis=1)) >= STORM_SHARE:
+            return "limits"
+        return None
+
+    def _flags(self, first: int, last: int) -> shared_memory.Integers:
+        return self._column(shared_memory.CONTACT_FLAGS, first, last)
+
+    def _column(self, column: int, first: int, last: int) -> shared_memory.Integers:
+        """(ticks, n_contacts)"""
+        rows = np.arange(first, last) % shared_memory.RECORDS
+        return self.memory.record_inputs[rows, :, column]
+
+    def _write(self, cause: str, head: int) -> None:
+        ticks = np.arange(max(0, head - KEPT_TICKS), head)
+        rows = ticks % shared_memory.RECORDS
+        times = self.memory.record_times[rows]
+        inputs = self.memory.record_inputs[rows]
+        motion = self.memory.record_motion[rows]
+        path = self.folder / f"palpate-{self.session}-tick{head}-{cause}.npz"
+        try:
+            buffer = io.BytesIO()
+            np.savez(
+                buffer,
+                contacts=np.array(self.contacts),
+                tick=ticks,
+                server_time_ns=times[:, shared_memory.START_NS],
+                deadline_ns=times[:, shared_memory.TICK_DEADLINE_NS],
+                compute_time_ns=times[:, shared_memory.COMPUTE_NS],
+                sequence=inputs[:, :, shared_memory.SEQUENCE],
+                client_time_ns=inputs[:, :, shared_memory.CLIENT_TIME_NS],
+                input_age_ns=inputs[:, :, shared_memory.AGE_NS],
+                flags=inputs[:, :, shared_memory.CONTACT_FLAGS],
+                displacement_m=motion[:, :, 0:3],
+                force_n=motion[:, :, 3:6],
+                force_scale=motion[:, :, shared_memory.SCALE],
+                energy_j=motion[:, :, shared_memory.ENERGY_J],
+            )
+            write_whole(path, buffer.getvalue())
+        except OSError as error:
+            log.warning("black box %s could not be written: %s", path, error)
+        else:
+            log.warning("%s: the last %d ticks are in %s", cause, len(ticks), path)

@@ -1,0 +1,270 @@
+"""The conservative discretisation against exact fields, quadratic finite elements, Lamb's ball and its own energy."""
+
+import numpy as np
+import pytest
+
+from palpate.discretization import conservative
+from palpate.discretization.consistency import vector_areas
+from palpate.geometry.fill import fill_surface
+from palpate.geometry.shapes import ball, box_lattice, box_surface
+from palpate.geometry.spacing import Refinement
+from palpate.meshfree import SupportError
+from palpate.scene.material import Material
+
+EPS = np.finfo(float).eps
+CUBE = Material(youngs_modulus_pa=1.0, poissons_ratio=0.3, density_kg_per_m3=10.0)
+# Hz: quadratic hexahedra, 8 x 8 x 8 (scikit-fem; computed again in the slow test below).
+CUBE_FREQUENCIES = np.array(
+    [
+        0.03365,
+        0.03365,
+        0.04571,
+        0.08037,
+        0.08894,
+        0.08894,
+        0.10966,
+        0.12988,
+        0.13525,
+        0.13824,
+        0.13854,
+        0.13854,
+    ]
+)
+# Lamb 1882, lambda = mu, angular frequency over c_s / a: torsional and spheroidal, five-fold each.
+LAMB = np.repeat([2.501, 2.640], 5)
+
+
+def _cube(n, jitter=0.0):
+    cloud = box_lattice((0, 0, 0), (1, 1, 1), (n, n, n), jitter, seed=3)
+    return cloud, np.flatnonzero(cloud.points[:, 2] == 0)
+
+
+def _top(cloud, radius):
+    away = np.linalg.norm(cloud.points[:, :2] - 0.5, axis=1)
+    return np.flatnonzero((away < radius) & (cloud.points[:, 2] == 1))
+
+
+def _cube_error(n, jitter):
+    cloud, bottom = _cube(n, jitter)
+    modes = conservative.elastic_modes(cloud, CUBE, bottom, [])
+    return np.abs(np.sqrt(modes.squared_frequencies[:12]) / (2 * np.pi) / CUBE_FREQUENCIES - 1)
+
+
+def _ball_frequencies(spacing):
+    material = Material(2.5, 0.25, 1.0)  # lambda = mu = 1
+    modes = conservative.elastic_modes(ball(1.0, spacing), material, [], [])
+    return np.sqrt(np.abs(modes.squared_frequencies[:16]) / material.shear_modulus_pa)
+
+
+CLOUDS = {
+    "lattice": lambda: _cube(6)[0],
+    "jittered": lambda: _cube(6, 0.25)[0],
+    "ball": lambda: ball(1.0, 0.28),
+    "graded": lambda: fill_surface(
+        box_surface((-1, -1, -1), (1, 1, 1)),
+        0.5,
+        (Refinement((0.2, 0.1, 1.0), 0.2, 0.1, growth=0.4, rings=True),),
+    ),
+}
+
+
+@pytest.fixture(params=CLOUDS)
+def cloud(request):
+    return CLOUDS[request.param]()
+
+
+def _linear_field(cloud):
+    strain = np.array([[0.3, 0.7, -0.2], [0.1, -0.4, 0.5], [0.6, 0.2, 0.9]])
+    return cloud.points @ strain.T, strain
+
+
+def test_strain_is_exact_for_linear_fields_and_zero_for_rigid_motions(cloud):
+    u, gradient = _linear_field(cloud)
+    for axis, d in enumerate(conservative.gradient(cloud)):
+        scale = 1e3 * EPS * np.abs(d).sum(axis=1).max() * np.abs(u).max()
+        np.testing.assert_allclose(d @ u, np.tile(gradient[:, axis], (cloud.n_nodes, 1)), atol=scale)
+        np.testing.assert_allclose(d @ np.ones(cloud.n_nodes), 0, atol=scale)
+
+
+def test_rigid_motions_need_no_force_and_linear_fields_store_the_exact_energy(cloud):
+    d = conservative.gradient(cloud)
+    k = conservative.stiffness(d, cloud.volumes, CUBE)
+    x = cloud.points
+    scale = 1e3 * EPS * np.abs(k).sum(axis=1).max()
+    for axis in np.eye(3):
+        for motion in (np.tile(axis, (cloud.n_nodes, 1)), np.cross(axis, x)):
+            np.testing.assert_allclose(k @ motion.ravel(), 0, atol=scale)
+    u, gradient = _linear_field(cloud)
+    strain = (gradient + gradient.T) / 2
+    density = 0.5 * CUBE.lame_lambda_pa * np.trace(strain) ** 2 + CUBE.shear_modulus_pa * np.sum(strain**2)
+    assert 0.5 * u.ravel() @ k @ u.ravel() == pytest.approx(density * cloud.volumes.sum(), rel=1e-11)
+
+
+def test_constant_stress_is_in_equilibrium_with_its_surface_tractions(cloud):
+    """The patch test: no force inside, traction times vector area on the boundary."""
+    k = conservative.stiffness(conservative.gradient(cloud), cloud.volumes, CUBE)
+    u, gradient = _linear_field(cloud)
+    stress = CUBE.lame_lambda_pa * np.trace(gradient) * np.eye(3) + CUBE.shear_modulus_pa * (
+        gradient + gradient.T
+    )
+    force = (k @ u.ravel()).reshape(-1, 3)
+    scale = 1e4 * EPS * np.abs(k).sum(axis=1).max()
+    np.testing.assert_allclose(force, vector_areas(cloud) @ stress, atol=scale)
+    np.testing.assert_allclose(force[~cloud.boundary], 0, atol=scale)
+
+
+def test_uniaxial_tension_is_solved_exactly():
+    """Bottom pulled against top, sides free: with nu = 0 the exact field is linear, and the force is E A / L."""
+    cloud, bottom = _cube(6, 0.25)
+    top = np.flatnonzero(cloud.points[:, 2] == 1)
+    modes = conservative.elastic_modes(cloud, Material(3.0, 0.0, 1.0), bottom, [top])
+    assert modes.static_stiffness[2, 2] == pytest.approx(3.0, rel=1e-10)
+
+
+def test_vector_areas_obey_the_divergence_theorem(cloud):
+    b = vector_areas(cloud)
+    np.testing.assert_allclose(b.sum(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(cloud.points.T @ b, cloud.volumes.sum() * np.eye(3), atol=1e-12)
+    assert not np.any(b[~cloud.boundary])
+
+
+def test_the_divergence_theorem_holds_to_local_round_off_where_spacing_spans_a_factor_of_twenty():
+    surface = box_surface((-20, -20, -20), (20, 20, 0))
+    cloud = fill_surface(surface, 5.0, (Refinement((0.0, 0.0, 0.0), 0.5, 0.25, growth=0.5, rings=True),))
+    assert cloud.spacing.max() / cloud.spacing.min() > 15
+    h, gradient = conservative.sparse_gradient(cloud, 2.2)
+    target = h.value.T @ vector_areas(cloud)
+    for axis, g in enumerate(gradient):
+        local = abs(g).T @ cloud.volumes
+        assert np.all(np.abs(g.T @ cloud.volumes - target[:, axis]) < 100 * EPS * local)
+
+
+def test_stiffness_is_symmetric_and_semi_definite_with_six_rigid_motions(cloud):
+    k = conservative.stiffness(conservative.gradient(cloud), cloud.volumes, CUBE)
+    np.testing.assert_allclose(k, k.T, atol=100 * EPS * np.abs(k).max())
+    eigenvalues = np.linalg.eigvalsh(k)
+    round_off = len(k) * EPS * eigenvalues[-1]
+    assert eigenvalues[0] > -round_off
+    assert np.sum(eigenvalues < 100 * round_off) == 6
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+def test_cube_frequencies_are_within_four_percent_at_nine_nodes_an_edge_and_improve_with_refinement(jitter):
+    coarse, medium, fine = (_cube_error(n, jitter) for n in (5, 7, 9))
+    assert fine.max() < 0.04
+    assert fine.max() < medium.max() < coarse.max()
+    assert np.linalg.norm(fine) < np.linalg.norm(medium) < np.linalg.norm(coarse)
+
+
+def test_a_free_ball_has_six_rigid_modes_and_lambs_frequencies_and_improves_with_refinement():
+    coarse, fine = _ball_frequencies(0.22), _ball_frequencies(0.16)
+    for frequencies in (coarse, fine):
+        assert frequencies[5] < 1e-4 < frequencies[6]
+    errors = [np.abs(f[6:] / LAMB - 1) for f in (coarse, fine)]
+    assert errors[1].max() < 0.04
+    assert errors[1].max() < errors[0].max()
+
+
+def test_modes_are_mass_normalised_and_diagonalise_the_stiffness():
+    cloud, bottom = _cube(5, 0.2)
+    modes = conservative.elastic_modes(cloud, CUBE, bottom, [])
+    k = conservative.stiffness(conservative.gradient(cloud), cloud.volumes, CUBE)
+    mass = np.repeat(CUBE.density_kg_per_m3 * cloud.volumes, 3)
+    phi = modes.shapes
+    np.testing.assert_allclose(phi.T @ (mass[:, None] * phi), np.eye(modes.n_modes), atol=1e-11)
+    scale = 1e-11 * modes.squared_frequencies[-1]
+    np.testing.assert_allclose(phi.T @ k @ phi, np.diag(modes.squared_frequencies), atol=scale)
+
+
+def test_the_tip_force_is_the_derivative_of_the_strain_energy():
+    cloud, bottom = _cube(6, 0.2)
+    modes = conservative.elastic_modes(cloud, CUBE, bottom, [_top(cloud, 0.3)])
+    k = conservative.stiffness(conservative.gradient(cloud), cloud.volumes, CUBE)
+
+    def energy(tip):
+        q = -(modes.input_coupling @ tip) / modes.squared_frequencies
+        u = modes.shapes @ q + modes.patch_shapes @ tip
+        return 0.5 * u @ k @ u
+
+    tip = np.array([0.1, -0.2, 0.3])
+    # The energy is quadratic, so its central difference is exact.
+    derivative = [(energy(tip + e) - energy(tip - e)) / 2 for e in np.eye(3)]
+    np.testing.assert_allclose(modes.static_stiffness @ tip, derivative, rtol=1e-9)
+    assert np.all(np.linalg.eigvalsh(modes.static_stiffness) > 0)
+    # More tissue can only be softer than the tip's own stiffness with everything else held.
+    assert np.all(np.linalg.eigvalsh(modes.direct_stiffness - modes.static_stiffness) > 0)
+
+
+def test_two_patches_influence_each_other_by_the_same_amount():
+    cloud, bottom = _cube(6)
+    left = np.flatnonzero((cloud.points[:, 2] == 1) & (cloud.points[:, 0] < 0.3))
+    right = np.flatnonzero((cloud.points[:, 2] == 1) & (cloud.points[:, 0] > 0.7))
+    modes = conservative.elastic_modes(cloud, CUBE, bottom, [left, right])
+    k = modes.static_stiffness
+    assert k.shape == (6, 6)
+    np.testing.assert_allclose(k, k.T, atol=1e-12 * np.abs(k).max())
+    assert np.abs(k[:3, 3:]).max() > 1e-3 * np.abs(k).max()
+    np.testing.assert_array_equal(modes.output_coupling, modes.input_coupling.T)
+    np.testing.assert_array_equal(modes.patch_shapes.sum(axis=0), np.repeat([len(left), len(right)], 3))
+
+
+def test_nearly_incompressible_tissue_does_not_lock():
+    """From nu = 0.3 to 0.499 lambda grows 290 times; stiffness and frequencies at equal G stay of one size."""
+    cloud, bottom = _cube(8, 0.2)
+    results = []
+    for nu in (0.3, 0.49, 0.499):
+        modes = conservative.elastic_modes(
+            cloud, Material(2 * (1 + nu), nu, 1.0), bottom, [_top(cloud, 0.25)]
+        )
+        results.append((modes.static_stiffness[2, 2], *np.sqrt(modes.squared_frequencies[:3])))
+    compressible, soft, nearly = np.array(results)
+    # Exact for a bonded punch on a half-space at equal G: 4 ln(3 - 4 nu) / (1 - 2 nu) grows by a third from 0.3 to 0.5.
+    assert np.all(nearly < 1.05 * soft)
+    assert np.all(nearly < 1.45 * compressible)
+
+
+def test_a_body_with_too_small_supports_is_refused_by_node():
+    cloud, bottom = _cube(5, 0.25)
+    with pytest.raises(SupportError, match=r"point \d+ at .* is covered by \d nodes.*enlarge"):
+        conservative.elastic_modes(cloud, CUBE, bottom, [], support_radius_factor=1.05)
+
+
+@pytest.mark.parametrize(
+    ("fixed", "contacts", "message"),
+    [
+        ([0, 125], [], r"fixed holds node 125: expected indices from 0 to 124"),
+        ([0, 0], [], "fixed names a node twice"),
+        ([0], [[]], r"contacts\[0\] is empty"),
+        ([0], [[1], [2, 0]], r"node 0 is in fixed and in contacts\[1\]"),
+        ([0.5], [], "fixed is float64"),
+        (np.arange(125), [], "all 125 nodes"),
+    ],
+)
+def test_inconsistent_supports_are_refused_by_name(fixed, contacts, message):
+    cloud, _ = _cube(5)
+    with pytest.raises(ValueError, match=message):
+        conservative.elastic_modes(cloud, CUBE, fixed, contacts)
+
+
+def test_a_cloud_too_large_for_all_its_modes_is_refused_with_the_memory_it_would_take(monkeypatch):
+    monkeypatch.setattr("os.sysconf", lambda name: 1024)
+    cloud, bottom = _cube(5)
+    with pytest.raises(MemoryError, match="all modes of 125 nodes need about"):
+        conservative.elastic_modes(cloud, CUBE, bottom, [])
+
+
+@pytest.mark.slow
+def test_the_table_of_cube_frequencies_is_that_of_quadratic_hexahedra():
+    from scipy.sparse.linalg import eigsh
+    from skfem import Basis, BilinearForm, ElementHex2, ElementVector, MeshHex, asm, condense
+    from skfem.helpers import dot
+    from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+    mesh = MeshHex.init_tensor(*[np.linspace(0, 1, 9)] * 3)
+    basis = Basis(mesh, ElementVector(ElementHex2()), intorder=4)
+    stiffness = asm(linear_elasticity(*lame_parameters(1.0, 0.3)), basis)
+    mass = asm(BilinearForm(lambda u, v, _: 10.0 * dot(u, v)), basis)
+    bottom = basis.get_dofs(lambda x: x[2] < 1e-9)
+    k, m, *_ = condense(stiffness, mass, D=bottom)
+    values = eigsh(k, 12, m, sigma=0.0, return_eigenvectors=False)
+    np.testing.assert_allclose(np.sqrt(np.sort(values)) / (2 * np.pi), CUBE_FREQUENCIES, atol=6e-6)

@@ -1,0 +1,252 @@
+"""The evidence measured in other ways: Hamiltonian eigenvalues, simulated pokes, held-out surface frequencies."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from palpate.lti.block_form import from_block_form, to_block_form
+from palpate.lti.frequencies import maximum
+from palpate.lti.pole_residue import DiagonalSystem
+from palpate.lti.viscoelastic import viscoelastic_system
+from palpate.modes.elastic_modes import ElasticModes
+from palpate.reduction import METHODS, discretise, fit_surface_output, measure, reduce
+from palpate.reduction.evidence import hinf_error, poke, step_through, time_domain_error
+from palpate.reduction.gramians import real_form
+from palpate.reduction.passivity import largest_energy_out, passive_up_to, passivity_margin, worst_poke
+from palpate.scene.material import PronySeries
+
+LIVER_LIKE = PronySeries((0.5, 0.3), (0.58, 0.004))
+PERIOD_S = 1e-3
+
+
+def lattice_body(n=4, spring=300.0, mass=1e-3):
+    """A cube of n³ masses joined by springs along edges and diagonals, bottom fixed, four top nodes one patch."""
+    points = np.array(list(itertools.product(range(n), repeat=3)))
+    number = {tuple(p): i for i, p in enumerate(points)}
+    stiffness = np.zeros((3 * n**3, 3 * n**3))
+    for p, step in itertools.product(points, itertools.product((-1, 0, 1), repeat=3)):
+        other = number.get(tuple(p + step))
+        if step > (0, 0, 0) and other is not None:
+            direction = np.array(step) / np.linalg.norm(step)
+            ends = np.add.outer(3 * np.array([number[tuple(p)], other]), np.arange(3)).ravel()
+            stiffness[np.ix_(ends, ends)] += spring * np.kron(
+                [[1, -1], [-1, 1]], np.outer(direction, direction)
+            )
+    patch = [number[n // 2 - 1 + i, n // 2 - 1 + j, n - 1] for i in (0, 1) for j in (0, 1)]
+    free = [i for i, p in enumerate(points) if p[2] > 0 and i not in patch]
+    f, t = (np.add.outer(3 * np.array(nodes), np.arange(3)).ravel() for nodes in (free, patch))
+    rigid = np.tile(np.eye(3), (4, 1))
+    mu, vectors = np.linalg.eigh(stiffness[np.ix_(f, f)] / mass)
+    vectors /= np.sqrt(mass)
+    shapes, patch_shapes = np.zeros((3 * n**3, len(mu))), np.zeros((3 * n**3, 3))
+    shapes[f], patch_shapes[t] = vectors, rigid
+    b = vectors.T @ stiffness[np.ix_(f, t)] @ rigid
+    return ElasticModes(mu, b, b.T.copy(), rigid.T @ stiffness[np.ix_(t, t)] @ rigid, shapes, patch_shapes)
+
+
+@pytest.fixture(scope="module")
+def modes():
+    return lattice_body()
+
+
+@pytest.fixture(scope="module")
+def full(modes):
+    return viscoelastic_system(modes, LIVER_LIKE)
+
+
+def evidence_of(full, method, order):
+    reduction = reduce(full, method, order=order)
+    return reduction, measure(
+        full,
+        reduction,
+        discretise(reduction.state_space, PERIOD_S),
+        period_s=PERIOD_S,
+        band_hz=(0.0, 30.0),
+        error_surface_in_band=0.25,
+        resolved_frequency_hz=12.0,
+    )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_figure_of_the_evidence_agrees_with_plain_sampling(full, method):
+    reduction, evidence = evidence_of(full, method, 60)
+    reduced = reduction.system
+    error = lambda w: np.linalg.norm(full.transfer(1j * w) - reduced.transfer(1j * w), 2, axis=(1, 2))  # noqa: E731
+    gain = lambda w: np.linalg.norm(full.transfer(1j * w), 2, axis=(1, 2))  # noqa: E731
+    band = 2 * np.pi * np.linspace(0, 30, 3001)
+    everywhere = np.concatenate([[0.0], np.geomspace(1e-2, 1e6, 6000)])
+    assert evidence.error_in_band_continuous == pytest.approx(np.max(error(band) / gain(band)), rel=0.02)
+    assert evidence.error_in_band_continuous >= np.max(error(band) / gain(band)) * (1 - 1e-9)
+    running = from_block_form(discretise(reduction.state_space, PERIOD_S))
+    sampled = np.linalg.norm(
+        full.transfer(1j * band) - running.transfer(np.exp(1j * band * PERIOD_S)), 2, (1, 2)
+    )
+    assert evidence.error_in_band == pytest.approx(np.max(sampled / gain(band)), rel=0.02)
+    assert evidence.error_static == pytest.approx((error(np.zeros(1)) / gain(np.zeros(1)))[0], abs=1e-12)
+    assert evidence.error_hinf >= np.max(error(everywhere)) / np.max(gain(everywhere)) * (1 - 1e-3)
+    assert evidence.spectral_abscissa == np.max(reduced.poles.real)
+    assert evidence.spectral_abscissa_full == full.spectral_abscissa
+    assert (evidence.error_surface_in_band, evidence.resolved_frequency_hz) == (0.25, 12.0)
+    if method == "tbr":
+        assert evidence.error_hinf <= evidence.error_bound
+    else:
+        assert evidence.error_bound is None
+
+
+def test_the_hinf_error_is_where_the_hamiltonian_touches_the_imaginary_axis(full):
+    """Boyd, Balakrishnan & Kabamba 1989: gamma is above the norm when the Hamiltonian has no imaginary eigenvalues."""
+    reduced = reduce(full, "tbr", order=40).system
+    omega = np.concatenate([np.geomspace(1e-2, 1e6, 4000), full.poles.imag])
+    largest = np.max(np.linalg.norm(full.transfer(1j * omega), 2, axis=(1, 2)))
+    found = hinf_error(full, reduced) * largest
+    forms = real_form(full), real_form(reduced)
+    n = full.n_states + reduced.n_states
+    a = np.zeros((n, n))
+    a[: full.n_states, : full.n_states] = forms[0].apply(np.eye(full.n_states))
+    a[full.n_states :, full.n_states :] = forms[1].apply(np.eye(reduced.n_states))
+    b, c = np.vstack([forms[0].b, forms[1].b]), np.hstack([forms[0].c, -forms[1].c])
+
+    def crosses(gamma):
+        hamiltonian = np.block([[a, b @ b.T / gamma], [-c.T @ c / gamma, -a.T]])
+        eigenvalues = np.linalg.eigvals(hamiltonian)
+        return np.any(np.abs(eigenvalues.real) < 1e-7 * np.abs(eigenvalues))
+
+    assert crosses(found * 0.99)
+    assert not crosses(found * 1.01)
+
+
+def test_the_peak_search_finds_a_resonance_between_its_samples():
+    peak = 12.345
+    omega, value = maximum(lambda w: 1 / np.hypot(w - peak, 1e-2), np.linspace(0, 30, 40))
+    assert omega == pytest.approx(peak, abs=1e-2)
+    assert value == pytest.approx(100, rel=0.05)
+
+
+def test_the_time_domain_error_is_that_of_stepping_both_models(full):
+    reduction = reduce(full, "tbr-band", order=40)
+    inputs = poke(3, PERIOD_S, (0.0, 30.0))
+    assert inputs.shape == (5001, 3)
+    assert np.max(np.abs(inputs)) == pytest.approx(1.05e-3, rel=0.01)
+    assert np.all(inputs[0] == 0)
+    assert np.all(inputs[-1] == 0)
+    exact = step_through(discretise(to_block_form(full), PERIOD_S), inputs)
+    running = discretise(reduction.state_space, PERIOD_S)
+    expected = np.max(np.linalg.norm(step_through(running, inputs) - exact, axis=1))
+    expected /= np.max(np.linalg.norm(exact, axis=1))
+    assert time_domain_error(full, running, inputs, PERIOD_S) == pytest.approx(expected, rel=1e-3, abs=1e-12)
+
+
+def worked_out(discrete_state_space, theta, amplitudes, n_cycles=400):
+    """Work of the last of many closed pokes u_k = Re(a e^{j theta k}), by the trapezoidal sum over samples, J."""
+    per_cycle = round(2 * np.pi / theta)
+    k = np.arange(n_cycles * per_cycle + 1)
+    u = np.real(np.exp(1j * theta * k)[:, None] * amplitudes)
+    force = step_through(discrete_state_space, u)[-per_cycle - 1 :]
+    u = u[-per_cycle - 1 :]
+    return np.sum((force[1:] + force[:-1]) / 2 * np.diff(u, axis=0))
+
+
+@pytest.mark.parametrize("per_cycle", [7, 40, 200])
+def test_the_work_of_a_closed_poke_is_what_the_formula_says(full, per_cycle):
+    running = discretise(reduce(full, "tbr", order=20).state_space, PERIOD_S)
+    theta = 2 * np.pi / per_cycle
+    a = np.array([1.0, 0.3 - 0.8j, -0.2j]) * 1e-3
+    g = from_block_form(running).transfer(np.array([np.exp(1j * theta)]))[0]
+    formula = np.pi * np.sin(theta) / theta * np.real(a.conj() @ (g - g.conj().T) / 2j @ a)
+    assert worked_out(running, theta, a) == pytest.approx(formula, rel=1e-6)
+
+
+def test_a_model_that_is_not_passive_gives_out_the_stated_energy_and_no_more():
+    """A stiffness that grows with a lag: one pole with a residue of the wrong sign."""
+    poles = np.array([-20.0 + 0j, -3 + 60j])
+    b = np.array([[1.0 + 0j, 0], [0.5, 1.0]])
+    active = DiagonalSystem(
+        poles, b, (b * np.array([[400.0], [300.0]])).T.copy(), 10 * np.eye(2), np.arange(2)
+    )
+    running = discretise(to_block_form(active), PERIOD_S)
+    system = from_block_form(running)
+    assert passivity_margin(system) < 0
+    most = largest_energy_out(system, 1e-3)
+    theta, a = worst_poke(system)
+    assert np.linalg.norm(a) == pytest.approx(1)
+    nearest = 2 * np.pi / round(2 * np.pi / theta)
+    assert -worked_out(running, nearest, 1e-3 * a) == pytest.approx(most, rel=1e-2)
+    rng = np.random.default_rng(0)
+    for per_cycle in (5, 31, 100, 300):
+        other = rng.standard_normal(2) + 1j * rng.standard_normal(2)
+        out = -worked_out(running, 2 * np.pi / per_cycle, 1e-3 * other / np.linalg.norm(other))
+        assert out <= most * (1 + 1e-6)
+
+
+def test_a_circular_poke_on_a_nonsymmetric_stiffness_gets_energy_out():
+    curl = np.array([[100.0, 20.0], [-20.0, 100.0]])
+    none = np.zeros(0, dtype=complex)
+    spring = DiagonalSystem(none, none.reshape(0, 2), none.reshape(2, 0), curl, np.zeros(0, dtype=int))
+    assert passivity_margin(spring) == pytest.approx(-20 / np.linalg.norm(curl, 2), rel=1e-6)
+    assert largest_energy_out(spring, 1e-3) == pytest.approx(np.pi * 20e-6, rel=1e-6)
+
+
+def test_the_full_symmetric_body_dissipates(full):
+    # Positive everywhere, but the sampled-data hold and round-off leave their own small amounts.
+    assert passivity_margin(from_block_form(discretise(to_block_form(full), PERIOD_S))) > -1e-9
+
+
+@pytest.mark.parametrize(("method", "order"), [("tbr-band", 50), ("modal-static", 200)])
+def test_surface_displacements_follow_the_full_model_between_the_fitted_frequencies(
+    modes, full, method, order
+):
+    running = discretise(reduce(full, method, order=order).state_space, PERIOD_S)
+    rows = np.arange(60)
+    surface = fit_surface_output(
+        modes,
+        LIVER_LIKE,
+        modes.shapes[rows],
+        modes.patch_shapes[rows],
+        running,
+        period_s=PERIOD_S,
+        band_hz=(0.0, 30.0),
+    )
+    assert surface.output.dtype == surface.feedthrough.dtype == np.float32
+    assert surface.error_in_band < 1e-2
+    for frequency in (0.0, 1.7, 13.3, 28.1):
+        s = 2j * np.pi * frequency
+        h = LIVER_LIKE.transfer_factor(np.array([s]))[0]
+        gain = -h / (s**2 + modes.squared_frequencies * h)
+        exact = (modes.shapes * gain)[rows] @ modes.input_coupling + modes.patch_shapes[rows]
+        xi = np.linalg.solve(np.exp(s * PERIOD_S) * np.eye(running.order) - running.dense_a(), running.b)
+        error = np.linalg.norm(surface.output @ xi + surface.feedthrough - exact, 2) / np.linalg.norm(
+            exact, 2
+        )
+        assert error <= (1e-4 if frequency == 0 else 1.5 * surface.error_in_band + 1e-6)
+
+
+def test_surface_shapes_that_do_not_match_the_modes_are_named(modes, full):
+    running = discretise(reduce(full, "tbr-band", order=20).state_space, PERIOD_S)
+    with pytest.raises(ValueError, match="surface_shapes"):
+        fit_surface_output(
+            modes,
+            LIVER_LIKE,
+            modes.shapes[:9, :-1],
+            modes.patch_shapes[:9],
+            running,
+            period_s=PERIOD_S,
+            band_hz=(0.0, 30.0),
+        )
+
+
+def test_a_system_that_turns_active_says_from_which_frequency_on(full):
+    pair = DiagonalSystem(
+        np.array([-3 + 40j, -60 + 900j]),
+        np.array([[4.0 + 0j], [30.0 + 0j]]),
+        np.array([[4.0j, -30.0j]]),
+        np.array([[500.0]]),
+        np.arange(2),
+    )
+    running = from_block_form(discretise(to_block_form(pair), PERIOD_S))
+    theta = np.linspace(1e-4, np.pi, 200001)
+    imaginary = running.transfer(np.exp(1j * theta))[:, 0, 0].imag
+    first = theta[np.argmax(imaginary < -1e-3 * abs(running.transfer(np.ones(1, dtype=complex))[0, 0, 0]))]
+    assert 0 < first < np.pi
+    assert passive_up_to(running) == pytest.approx(first, abs=1e-4)
+    assert passive_up_to(from_block_form(discretise(to_block_form(full), PERIOD_S))) == np.pi
