@@ -2,7 +2,7 @@
 
     python benchmarks/balanced_truncation.py [--order 120] [--timeout 900] [--threads 1] [--counts 5,5,5 6,6,7 10,10,10] [--contenders palpate SLICOT]
 
-Everyone gets the mass-normalised stiffness of a `conservative` cube with its contact patch and the Prony series, or the
+Everyone gets the mass-normalized stiffness of a `conservative` cube with its contact patch and the Prony series, or the
 first-order matrices made of them (x = u, v and the memories; E = I), and returns a model of the same order. A run has a
 process of its own; wall and processor seconds are of the reduction alone (for ours the eigendecomposition of the stiffness
 included, for the others the assembly of A excluded), memory is the peak of the process, error the largest |F - F_reduced|
@@ -38,7 +38,7 @@ CONTENDERS = ("palpate", "palpate plain", "SLICOT", "pyMOR dense", "pyMOR low-ra
 
 
 def cube(counts: tuple[int, int, int]) -> dict[str, Array]:
-    """Mass-normalised stiffness blocks of the paper's cube (section 4.2), its contact the nodes at the top centre."""
+    """Mass-normalized stiffness blocks of the paper's cube (section 4.2), its contact the nodes at the top center."""
     from palpate.discretization import conservative
     from palpate.geometry.shapes import box_lattice
     from palpate.scene.material import PRESETS

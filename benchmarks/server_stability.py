@@ -7,7 +7,7 @@ each of its ticks, and which command each tick of the server used: jitter, late 
 of 0.05 to 0.2 kg with 0.1 to 2 N s/m, held by a hand (200 N/m, 0.3 N s/m), is pressed 5 mm into the model, with that order of
 events: in pieces of 8 s that begin at random places of what was measured. Beside it, forces that are exactly one, two and
 three ticks old. The model is made softer and stiffer; so are a sample, and a spring without any losses of its own.
-`palpate_server.diagnostics.simulated_device` says how time is modelled and what counts as stable.
+`palpate_server.diagnostics.simulated_device` says how time is modeled and what counts as stable.
 
 Colgate & Schenkel (1997): a sampled spring K can't make any passive hand vibrate when b > K (T/2 + D), b being the damping
 of handle and hand, D the time from a position to its force: here the 99th percentile of the age of the forces rendered.

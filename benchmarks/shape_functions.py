@@ -2,7 +2,7 @@
 
     python benchmarks/shape_functions.py [--points 10000] [--order 2]
 
-Both get the same neighbour lists, so that only the evaluation is compared; the ratio of points per second is printed,
+Both get the same neighbor lists, so that only the evaluation is compared; the ratio of points per second is printed,
 and the largest relative difference of the results, which shows that both compute the same.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.meshfree.kernel import evaluate
-from palpate.meshfree.neighbours import covering_nodes
+from palpate.meshfree.neighbors import covering_nodes
 
 Array = NDArray[np.float64]
 SECOND = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
@@ -117,9 +117,9 @@ def main() -> None:
     peer, b = seconds(lambda: batched_numpy(points, x, radii, indptr, indices, arguments.order), 1)
     difference = max(np.abs(u - v).max() / np.abs(v).max() for u, v in zip(a, b, strict=True))
     print(
-        f"{len(points)} points, order {arguments.order}, {len(indices) / len(points):.1f} neighbours, value + 3 + 6 derivatives"
+        f"{len(points)} points, order {arguments.order}, {len(indices) / len(points):.1f} neighbors, value + 3 + 6 derivatives"
     )
-    print(f"neighbour search (scipy cKDTree)  {len(points) / search:12,.0f} points/s")
+    print(f"neighbor search (scipy cKDTree)  {len(points) / search:12,.0f} points/s")
     print(f"compiled kernel                   {len(points) / ours:12,.0f} points/s")
     print(f"batched numpy                     {len(points) / peer:12,.0f} points/s")
     print(f"ratio {peer / ours:.0f}, largest relative difference {difference:.1e}")

@@ -76,7 +76,7 @@ def read_inrimage(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
 def smooth_surface(mask: NDArray[np.bool_], voxel_m: NDArray[np.float64], volume: float) -> trimesh.Trimesh:
     """Surface of the blurred mask (nx, ny, nz) at the level where it encloses `volume`, m³; its largest piece.
 
-    In m from the image's corner: the centre of voxel i is at (i + 0.5) voxel_m.
+    In m from the image's corner: the center of voxel i is at (i + 0.5) voxel_m.
     """
     margin = np.ceil(6 * BLUR_M / voxel_m).astype(int)
     blurred = ndimage.gaussian_filter(

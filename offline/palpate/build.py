@@ -22,12 +22,12 @@ from palpate.geometry.shapes import ball, box_lattice
 from palpate.geometry.spacing import Refinement, SpacingField
 from palpate.geometry.surface import load_surface
 from palpate.lti.pole_residue import DiagonalSystem
-from palpate.lti.sampling import discretise, sampled_response
+from palpate.lti.sampling import discretize, sampled_response
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.meshfree import shape_functions
 from palpate.model_file import Contact, PoleResidueSystem, ReducedModel, Surface
 from palpate.modes.elastic_modes import ElasticModes
-from palpate.reduction.evidence import measure
+from palpate.reduction.accuracy import measure
 from palpate.reduction.methods import reduce
 from palpate.reduction.surface import fit_surface_output
 from palpate.scene.material import Material
@@ -71,7 +71,7 @@ class FullModel:
 
     fixed     node indices that are held
     contacts  the patches, in the order of the inputs
-    system    from patch displacement (m) to reaction force (N), exact in time for the discretised body
+    system    from patch displacement (m) to reaction force (N), exact in time for the discretized body
     """
 
     cloud: NodeCloud
@@ -102,7 +102,7 @@ def build_model(config: Config, folder: Path, report: Report) -> ReducedModel:
         response=lambda reduced, omega: sampled_response(reduced, omega, period_s, rule, band_hz[1]),
     )
     continuous = reduction.state_space
-    discrete = discretise(continuous, period_s, rule, band_hz[1])
+    discrete = discretize(continuous, period_s, rule, band_hz[1])
     report.note(f"{full.system.n_states:,} → {continuous.order} states")
 
     report("surface")
@@ -114,8 +114,8 @@ def build_model(config: Config, folder: Path, report: Report) -> ReducedModel:
     del shapes, patch_shapes
     report.note(f"{len(vertices_surface.vertices):,} vertices")
 
-    report("evidence")
-    evidence = measure(
+    report("accuracy")
+    accuracy = measure(
         full.system,
         reduction,
         discrete,
@@ -124,7 +124,7 @@ def build_model(config: Config, folder: Path, report: Report) -> ReducedModel:
         error_surface_in_band=fitted.error_in_band,
         resolved_frequency_hz=resolved_frequency_hz(full.cloud, full.material),
     )
-    report.note(f"force error in band {100 * evidence.error_in_band:.2g} %")
+    report.note(f"force error in band {100 * accuracy.error_in_band:.2g} %")
     return ReducedModel(
         name=config.name,
         method=config.reduction.method,
@@ -142,7 +142,7 @@ def build_model(config: Config, folder: Path, report: Report) -> ReducedModel:
             output=fitted.output,
             feedthrough=fitted.feedthrough,
         ),
-        evidence=evidence,
+        accuracy=accuracy,
         config=canonical_text(config),
         config_sha256=digest,
         built_with=f"palpate {version('palpate')}",

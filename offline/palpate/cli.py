@@ -88,7 +88,7 @@ def build(
         typer.Option(help="Largest relative force error inside the haptic band, such as 0.02 or 2%."),
     ] = None,
 ) -> None:
-    """Build a scene into a model file and print the evidence of its accuracy."""
+    """Build a scene into a model file and print the report of its accuracy."""
     from palpate.model_file import check_writable, save_model
     from palpate.scene.schema import load_config, override_reduction
 
@@ -106,7 +106,7 @@ def build(
 
         model = build_model(scene, config.parent, report)
     save_model(model, path)
-    print_evidence(model)
+    print_accuracy(model)
     size = path.stat().st_size / 2**20
     console.print(
         f"wrote [bold]{path}[/] ({size:.1f} MiB) in {time.monotonic() - start:.0f} s", highlight=False
@@ -125,7 +125,7 @@ def inspect(
     if as_json:
         sys.stdout.write(json.dumps(loaded.summary(), indent=2) + "\n")
     else:
-        print_evidence(loaded)
+        print_accuracy(loaded)
 
 
 @app.command(context_settings=PASS_THROUGH)
@@ -174,7 +174,7 @@ def demo(
 
     with stage_reporter() as report:
         summary = run_demo(Path(str(files("palpate_configs") / "liver.toml")), out, seconds, report)
-    print_evidence(summary.model)
+    print_accuracy(summary.model)
     summary.print(console)
 
 
@@ -252,15 +252,15 @@ class Stages:
             self._name = None
 
 
-def print_evidence(model: ReducedModel) -> None:
-    """The model and the evidence of its accuracy as a table."""
-    from palpate.report import evidence_table
+def print_accuracy(model: ReducedModel) -> None:
+    """The model and the report of its accuracy as a table."""
+    from palpate.report import accuracy_table
 
-    console.print(evidence_table(model))
-    if model.evidence.error_in_band > 0.5:
+    console.print(accuracy_table(model))
+    if model.accuracy.error_in_band > 0.5:
         console.print(
             f"[yellow]In the band this model is not the body: {model.method} at order {model.order} leaves the force wrong by "
-            f"{100 * model.evidence.error_in_band:.0f} %. Raise the order, or use tbr-band.[/]",
+            f"{100 * model.accuracy.error_in_band:.0f} %. Raise the order, or use tbr-band.[/]",
             highlight=False,
         )
 

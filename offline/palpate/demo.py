@@ -61,7 +61,7 @@ class Demo:
             f"depth         up to {1e3 * depth.max():.2f} mm",
             f"force         {force.min():+.3f} to {force.max():+.3f} N along the inward normal",
             f"full model    served and exact force differ by at most {100 * self.error_in_band:.2g} % of the largest "
-            f"force below {self.model.evidence.band_hz[1]:g} Hz (the file states {100 * self.model.evidence.error_in_band:.2g} %); "
+            f"force below {self.model.accuracy.band_hz[1]:g} Hz (the file states {100 * self.model.accuracy.error_in_band:.2g} %); "
             f"{100 * self.error:.2g} % with all that late commands add above",
             f"contract      {'BROKEN: ' + '; '.join(self.client['contract_broken']) if self.client['contract_broken'] else 'held'}",
             f"model         {self.model_path}",

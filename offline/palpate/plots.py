@@ -33,7 +33,7 @@ class Touch:
 
     def in_band(self, signal: Array, model: ReducedModel) -> Array:
         """The part of a signal (n_ticks, k) within the model's haptic band, without delay."""
-        low, high = model.evidence.band_hz
+        low, high = model.accuracy.band_hz
         rate = 1 / model.period_s
         if low == 0:
             filter_ = butter(4, high, "lowpass", fs=rate, output="sos")
@@ -89,11 +89,11 @@ def draw_touch(model: ReducedModel, touch: Touch, contact: int, path: Path) -> N
     difference = touch.force_n - touch.force_full_n
     for values, style, label in (
         (difference, {"color": "0.75", "linewidth": 0.6}, "every frequency"),
-        (touch.in_band(difference, model), {"color": "tab:blue"}, f"below {model.evidence.band_hz[1]:g} Hz"),
+        (touch.in_band(difference, model), {"color": "tab:blue"}, f"below {model.accuracy.band_hz[1]:g} Hz"),
     ):
         error = np.linalg.norm(values, axis=1) / largest
         axes[2].semilogy(touch.time_s, np.maximum(error, 1e-6), label=label, **style)
-    stated = model.evidence.error_in_band
+    stated = model.accuracy.error_in_band
     axes[2].axhline(
         stated, color="tab:orange", linestyle="--", label=f"stated in-band error, {100 * stated:.2g} %"
     )
@@ -121,7 +121,7 @@ def surface_displacement(model: ReducedModel, displacement_m: Array) -> Array:
 
 
 def _draw_body(figure: Any, model: ReducedModel, contact: int, displacement: Array) -> None:
-    """The deformed surface, coloured by how far it moved, seen from above the contact."""
+    """The deformed surface, colored by how far it moved, seen from above the contact."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection

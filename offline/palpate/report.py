@@ -1,4 +1,4 @@
-"""The evidence of a model's accuracy as a table for a person."""
+"""The accuracy report of a model as a table for a person."""
 
 from __future__ import annotations
 
@@ -21,52 +21,52 @@ def marked(fraction: float) -> str:
     return f"[yellow]{percent(fraction)}[/]" if fraction > _NOTABLE else percent(fraction)
 
 
-def evidence_table(model: ReducedModel) -> Table:
+def accuracy_table(model: ReducedModel) -> Table:
     """What the model is and how good it is, a line each."""
-    evidence = model.evidence
+    accuracy = model.accuracy
     table = Table(
         title=f"{model.name}: {model.method}, order {model.order}",
         title_justify="left",
         box=box.SIMPLE_HEAD,
         pad_edge=False,
     )
-    table.add_column("evidence", no_wrap=True)
+    table.add_column("accuracy", no_wrap=True)
     table.add_column("value", justify="right", no_wrap=True)
     table.add_column("meaning", style="dim")
 
-    low, high = evidence.band_hz
-    bound = "none" if evidence.error_bound is None else percent(evidence.error_bound)
+    low, high = accuracy.band_hz
+    bound = "none" if accuracy.error_bound is None else percent(accuracy.error_bound)
     table.add_row(
         "states",
         f"{model.n_states_full:,} → {model.order}",
         f"{model.n_nodes:,} nodes",
     )
-    table.add_row("error in band", marked(evidence.error_in_band), f"force, largest in {low:g}-{high:g} Hz")
-    table.add_row("before sampling", marked(evidence.error_in_band_continuous), "the reduction's share of it")
-    table.add_row("error at 0 Hz", marked(evidence.error_static), "static force")
-    table.add_row("error, H-infinity", percent(evidence.error_hinf), "of the largest response")
+    table.add_row("error in band", marked(accuracy.error_in_band), f"force, largest in {low:g}-{high:g} Hz")
+    table.add_row("before sampling", marked(accuracy.error_in_band_continuous), "the reduction's share of it")
+    table.add_row("error at 0 Hz", marked(accuracy.error_static), "static force")
+    table.add_row("error, H-infinity", percent(accuracy.error_hinf), "of the largest response")
     table.add_row("bound, H-infinity", bound, "a priori")
-    table.add_row("error in time", marked(evidence.error_time_domain), "force during a poke")
-    table.add_row("error of the surface", marked(evidence.error_surface_in_band), "displacement in the band")
+    table.add_row("error in time", marked(accuracy.error_time_domain), "force during a poke")
+    table.add_row("error of the surface", marked(accuracy.error_surface_in_band), "displacement in the band")
     table.add_row(
         "spectral abscissa",
-        f"{evidence.spectral_abscissa:.3g}",
+        f"{accuracy.spectral_abscissa:.3g}",
         "1/s; below 0: stable",
     )
     table.add_row(
         "passivity margin",
-        f"{evidence.passivity_margin:.2g}",
+        f"{accuracy.passivity_margin:.2g}",
         "below 0: can give out energy",
     )
     table.add_row(
-        "passive up to", f"{evidence.passive_up_to_hz:.3g} Hz", "only faster pokes can get energy out"
+        "passive up to", f"{accuracy.passive_up_to_hz:.3g} Hz", "only faster pokes can get energy out"
     )
     table.add_row(
         "energy given out",
-        f"{evidence.largest_energy_out_j:.2g} J",
+        f"{accuracy.largest_energy_out_j:.2g} J",
         "at most, by a closed poke of 1 mm",
     )
-    resolved = evidence.resolved_frequency_hz
+    resolved = accuracy.resolved_frequency_hz
     meaning = "shear waves, 6 nodes each"
     if resolved < high:
         meaning += f"; [yellow]band: {high:g} Hz[/]"

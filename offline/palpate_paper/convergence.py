@@ -140,7 +140,7 @@ def membrane_errors(
     spot_radius: float,
     exact_modes: Callable[[Array, float], tuple[Array, Array, Array]],
 ) -> list[Error]:
-    """Errors of both discretisations and of linear triangles on the same nodes, weighted with the nodal areas."""
+    """Errors of both discretizations and of linear triangles on the same nodes, weighted with the nodal areas."""
     errors = []
     for cloud in clouds:
         middle = (cloud.points.min(axis=0) + cloud.points.max(axis=0)) / 2
@@ -172,7 +172,7 @@ def deflections(mu: Any, shapes: Any, load: Any, prony: PronySeries) -> Array:
 
 
 def cube_errors(counts: Sequence[int], reference_elements: int) -> list[Error]:
-    """Errors of both discretisations and of linear tetrahedra on lattices of counts³ nodes, weighted with the volumes.
+    """Errors of both discretizations and of linear tetrahedra on lattices of counts³ nodes, weighted with the volumes.
 
     At every frequency of CUBE_FREQUENCIES_HZ; names end with the frequency but for the first.
     """
@@ -239,7 +239,7 @@ def _meshfree(cloud: Membrane) -> list[tuple[str, ElasticModes]]:
 
 _MEMBRANE_FINDINGS = (
     f"Deflection at {TIME_S:g} s under the paper's history as a force on a smooth spot, error at the nodes weighted with their "
-    "areas, the same nodes for all methods; exact in time, so that only the discretisation counts. The orders over "
+    "areas, the same nodes for all methods; exact in time, so that only the discretization counts. The orders over "
     f"{DURATION_S:g} s are those of the error's root mean square over all times: at a single instant a phase may happen to be right "
     "on coarse nodes, which the finer ones then seem to improve on too slowly. "
 )
@@ -284,14 +284,14 @@ def _figure(
         for method in methods:
             own = by_method[method]
             dashed = method.endswith(_VARIANTS)
-            colour, marker = next(style for name, style in _STYLES.items() if method.startswith(name))
+            color, marker = next(style for name, style in _STYLES.items() if method.startswith(name))
             axis.loglog(
                 [e.n_nodes for e in own],
                 [e.value for e in own],
                 marker + ("--" if dashed else "-"),
-                color=colour,
+                color=color,
                 markersize=5,
-                markerfacecolor="none" if dashed else colour,
+                markerfacecolor="none" if dashed else color,
                 linewidth=1.2,
                 label=f"{method} (order {_one_digit(orders[method].finest)})",
             )
@@ -362,7 +362,7 @@ def _order_table(by_method: dict[str, list[Error]], orders: dict[str, Orders], n
     if number == _RANKED_BY_THE_PAPER:
         confirmed = all(min(r) > 1 for m, r in ratios.items() if m.startswith("collocation"))
         said += f" That {'confirms' if confirmed else 'does not confirm'} the paper's finding, for its own method."
-    said += " Of the conservative discretisation, which is ours, " + "; ".join(
+    said += " Of the conservative discretization, which is ours, " + "; ".join(
         f"{m} is {_verdict(r)}"
         + (f", over {DURATION_S:g} s {_verdict(_ratios(by_method, m, over_time=True))}" if timed else "")
         for m, r in ratios.items()

@@ -39,17 +39,17 @@ def error_and_time(study: Study, example: Example, number: int) -> Figure:
     def draw(canvas: Any) -> None:
         left, middle, right = canvas.subplots(1, 3)
         labels = [f"{c.method.name} {c.reduced.order}" for c in compared]
-        colours = [c.method.colour for c in compared]
-        _bars(left, labels, [100 * c.error_time for c in compared], colours, lambda v: per_cent(v / 100))
+        colors = [c.method.color for c in compared]
+        _bars(left, labels, [100 * c.error_time for c in compared], colors, lambda v: per_cent(v / 100))
         left.set(xlabel="relative error of the force, %", title="error")
         with_full = [*labels, "full, blocks", "full, Newmark"]
         times = [*(c.stepping_s for c in compared), full.blocks_s, full.newmark_s]
-        _bars(middle, with_full, times, [*colours, "0.6", "0.35"], seconds)
+        _bars(middle, with_full, times, [*colors, "0.6", "0.35"], seconds)
         middle.set(
             xlabel="seconds",
             title=f"solution time, {example.times_s[-1]:g} s in {len(example.inputs) - 1:,} steps",
         )
-        _bars(right, labels, [c.reduced.seconds for c in compared], colours, seconds)
+        _bars(right, labels, [c.reduced.seconds for c in compared], colors, seconds)
         right.set(xlabel="seconds", title="time of the reduction itself")
 
     return Figure(
@@ -95,7 +95,7 @@ def products(study: Study) -> Figure:
                     x,
                     [max(float(r[column]), 1e-16) for r in of_method],
                     0.25,
-                    color=method.colour,
+                    color=method.color,
                     label=method.label,
                 )
             axis.set_yscale("log")
@@ -187,11 +187,11 @@ def _at_equal_order(compared: Sequence[Comparison], n_steps: int) -> str:
 
 
 def _bars(
-    axis: Any, labels: Sequence[str], values: Sequence[float], colours: Sequence[str], text: Any
+    axis: Any, labels: Sequence[str], values: Sequence[float], colors: Sequence[str], text: Any
 ) -> None:
     shown = [max(v, 1e-13) for v in values]
     places = np.arange(len(labels))
-    axis.barh(places, shown, color=colours)
+    axis.barh(places, shown, color=colors)
     axis.set_yticks(places, labels, fontsize="small")
     axis.invert_yaxis()
     axis.set_xscale("log")

@@ -20,7 +20,7 @@ from palpate_paper.membranes import Membrane, disc_membrane, square_membrane
 from palpate_paper.time_integration import EquationsOfMotion
 
 Array = NDArray[np.float64]
-Discretisation = Literal["conservative", "collocation"]
+Discretization = Literal["conservative", "collocation"]
 
 PERIOD_S = 0.001
 DISC_DRAG_PER_S = 0.01
@@ -41,7 +41,7 @@ class Example:
     system       from the tip's displacement, m, to the reaction force, N, one component for membranes, three in space
     equations    the same model, sparse, for Newmark's method; without the disc's drag
     prony        the material's memory
-    n_nodes      of the discretisation
+    n_nodes      of the discretization
     n_unknowns   displacement components that are free to move
     order        of the reduced models: the paper's, where it states one
     small_order  a tenth of that
@@ -67,16 +67,16 @@ class Example:
         return np.asarray(PERIOD_S * np.arange(len(self.inputs)), dtype=np.float64)
 
 
-def disc(n_nodes: int = 500, discretisation: Discretisation = "conservative") -> Example:
+def disc(n_nodes: int = 500, discretization: Discretization = "conservative") -> Example:
     """Section 4.1.1: elastic disc, everything 1, 600 of 800 states in the paper."""
     cloud = disc_membrane(n_nodes)
-    tip = centre_of(cloud)
-    modes = _membrane_modes(cloud, tip, discretisation)
+    tip = center_of(cloud)
+    modes = _membrane_modes(cloud, tip, discretization)
     order = round(0.75 * 2 * modes.n_modes / 2) * 2 if n_nodes < 400 else 600
     return Example(
         "disc",
         with_drag(modes, DISC_DRAG_PER_S),
-        _membrane_equations(cloud, tip, discretisation),
+        _membrane_equations(cloud, tip, discretization),
         PronySeries(),
         n_nodes,
         modes.n_modes,
@@ -88,16 +88,16 @@ def disc(n_nodes: int = 500, discretisation: Discretisation = "conservative") ->
     )
 
 
-def square(count: int = 15, discretisation: Discretisation = "conservative") -> Example:
+def square(count: int = 15, discretization: Discretization = "conservative") -> Example:
     """Section 4.1.2: viscoelastic square, count² nodes; the paper has 200, and reduces 400 states to 200."""
     cloud = square_membrane(count**2)
-    tip = centre_of(cloud)
-    modes = _membrane_modes(cloud, tip, discretisation)
+    tip = center_of(cloud)
+    modes = _membrane_modes(cloud, tip, discretization)
     order = 200 if count >= 15 else modes.n_modes
     return Example(
         "square",
         viscoelastic_system(modes, SQUARE_PRONY),
-        _membrane_equations(cloud, tip, discretisation),
+        _membrane_equations(cloud, tip, discretization),
         SQUARE_PRONY,
         cloud.n_nodes,
         modes.n_modes,
@@ -109,13 +109,13 @@ def square(count: int = 15, discretisation: Discretisation = "conservative") -> 
     )
 
 
-def cube(nodes_an_edge: int = 10, discretisation: Discretisation = "conservative") -> Example:
+def cube(nodes_an_edge: int = 10, discretization: Discretization = "conservative") -> Example:
     """Section 4.2: viscoelastic cube on a lattice, bottom fixed, the middle of the top moved up and down; no order given.
 
     An even number of nodes an edge has no node in the middle: the four around it are the tip.
     """
     cloud, fixed, tip = cube_parts(nodes_an_edge)
-    space = conservative if discretisation == "conservative" else collocation
+    space = conservative if discretization == "conservative" else collocation
     modes = space.elastic_modes(cloud, CUBE_MATERIAL, fixed, [tip])
     order = 300 if nodes_an_edge >= 10 else 100
     times = PERIOD_S * np.arange(5001)
@@ -152,7 +152,7 @@ def cube_parts(nodes_an_edge: int) -> tuple[NodeCloud, NDArray[np.intp], NDArray
     )
 
 
-def centre_of(cloud: Membrane) -> list[int]:
+def center_of(cloud: Membrane) -> list[int]:
     """The node in the middle of the membrane."""
     middle = (cloud.points.min(axis=0) + cloud.points.max(axis=0)) / 2
     return [int(np.argmin(np.linalg.norm(cloud.points - middle, axis=1)))]
@@ -196,13 +196,13 @@ def with_drag(modes: ElasticModes, drag_per_s: float) -> DiagonalSystem:
     )
 
 
-def _membrane_modes(cloud: Membrane, tip: list[int], discretisation: Discretisation) -> ElasticModes:
-    if discretisation == "conservative":
+def _membrane_modes(cloud: Membrane, tip: list[int], discretization: Discretization) -> ElasticModes:
+    if discretization == "conservative":
         return membrane.conservative_modes(cloud, [tip])
     return membrane.collocation_modes(cloud, [tip])
 
 
-def _membrane_equations(cloud: Membrane, tip: list[int], discretisation: Discretisation) -> EquationsOfMotion:
-    if discretisation == "conservative":
+def _membrane_equations(cloud: Membrane, tip: list[int], discretization: Discretization) -> EquationsOfMotion:
+    if discretization == "conservative":
         return membrane.conservative_equations(cloud, [tip])
     return membrane.collocation_equations(cloud, [tip])

@@ -61,7 +61,7 @@ class Figure:
 
 
 def _use_palette(path: Path) -> None:
-    """256 colours are enough for lines and text, in half the bytes."""
+    """256 colors are enough for lines and text, in half the bytes."""
     from PIL import Image
 
     with Image.open(path) as image:

@@ -33,7 +33,7 @@ def require_scikit_fem() -> None:
 
 
 def membrane_modes(
-    points: Array, edge: NDArray[np.intp], centre: Array, radius: float
+    points: Array, edge: NDArray[np.intp], center: Array, radius: float
 ) -> tuple[Array, Array, Array]:
     """(mu, shapes, load) of linear triangles on the nodes (Delaunay), consistent mass, everything 1, held at `edge`.
 
@@ -54,7 +54,7 @@ def membrane_modes(
     mass = BilinearForm(lambda u, v, w: u * v).assemble(basis).toarray()
 
     def pressure(v: Any, w: Any) -> Any:
-        return spot(np.hypot(w.x[0] - centre[0], w.x[1] - centre[1]), radius) * v
+        return spot(np.hypot(w.x[0] - center[0], w.x[1] - center[1]), radius) * v
 
     load = LinearForm(pressure).assemble(basis)
     free = np.setdiff1d(np.arange(len(points)), edge)

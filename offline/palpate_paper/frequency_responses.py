@@ -40,12 +40,12 @@ def frequency_response(study: Study, example: Example, number: int) -> Figure:
         for i, (model, response) in enumerate(zip(models, responses, strict=True)):
             top, bottom = axes[:, i]
             top.loglog(hz, np.abs(exact), color="0.6", linewidth=2.2, label=f"full, {full.n_states:,}")
-            colour = model.method.colour
-            top.loglog(hz, np.abs(response), color=colour, linewidth=0.9, label=f"reduced, {model.order}")
+            color = model.method.color
+            top.loglog(hz, np.abs(response), color=color, linewidth=0.9, label=f"reduced, {model.order}")
             top.set_title(f"({'abcd'[i]}) {model.method.name}, {model.order} states", fontsize="medium")
             top.legend(frameon=False, fontsize="small", loc="best")
             error = np.abs(response - exact) / np.abs(exact)
-            bottom.loglog(hz, np.maximum(error, 1e-16), color=colour, linewidth=0.9)
+            bottom.loglog(hz, np.maximum(error, 1e-16), color=color, linewidth=0.9)
             bottom.set(xlabel="frequency, Hz", ylim=(floor, 30))
             tidy(top)
             tidy(bottom)

@@ -20,9 +20,9 @@ class FullSolution:
     """The driven channel's reaction force (n_samples,), N, two ways, and the processor time of the whole history.
 
     exact      of the modes, for displacements that are linear between samples
-    newmark    average acceleration, one sparse factorisation
+    newmark    average acceleration, one sparse factorization
     blocks_s   the modes stepped by the compiled loop that steps the reduced models, s
-    newmark_s  the factorisation and all steps, s
+    newmark_s  the factorization and all steps, s
     """
 
     exact: Array

@@ -1,4 +1,4 @@
-"""The transverse vibration of a membrane held at its edge, rho u'' = T lap(u), by both discretisations.
+"""The transverse vibration of a membrane held at its edge, rho u'' = T lap(u), by both discretizations.
 
 BaniHani & De 2009, section 4.1. Inputs are the deflections of node groups (the paper's tool tip is the middle node),
 outputs the transverse forces there, newton. `ElasticModes` has one component a node here.

@@ -1,4 +1,4 @@
-"""The first ten frequencies of the disc and of the square against the exact ones, by each discretisation."""
+"""The first ten frequencies of the disc and of the square against the exact ones, by each discretization."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def square_frequencies() -> Array:
 
 
 def disc(quick: bool = False) -> list[FrequencyErrors]:
-    """Both discretisations with each number of nodes, and linear triangles with about as many."""
+    """Both discretizations with each number of nodes, and linear triangles with about as many."""
     require_scikit_fem()
     from palpate_paper import finite_elements
 
@@ -63,7 +63,7 @@ def disc(quick: bool = False) -> list[FrequencyErrors]:
 
 
 def square(quick: bool = False) -> list[FrequencyErrors]:
-    """Both discretisations and linear triangles on the same lattices."""
+    """Both discretizations and linear triangles on the same lattices."""
     require_scikit_fem()
     from palpate_paper import finite_elements
 

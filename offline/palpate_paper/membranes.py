@@ -21,7 +21,7 @@ class Membrane:
     points   (n_nodes, 2), m
     areas    (n_nodes,), m²; they sum to the region's area
     edge     (n_nodes, 2), m: outward normal times the length of edge that the node stands for; zero inside
-    spacing  (n_nodes,), m; local distance between neighbouring nodes
+    spacing  (n_nodes,), m; local distance between neighboring nodes
     """
 
     points: Array
@@ -40,10 +40,10 @@ class Membrane:
 
 
 def disc_membrane(n_nodes: int, radius_m: float = 1.0) -> Membrane:
-    """Disc with a node at its centre and equally spaced nodes on rings about one spacing apart.
+    """Disc with a node at its center and equally spaced nodes on rings about one spacing apart.
 
     Ring k has about 2 pi k nodes, so that the spacing is the same everywhere (rings of equally many nodes crowd at the
-    centre, and collocation fails there). Raises ValueError below 19 nodes (centre and two rings).
+    center, and collocation fails there). Raises ValueError below 19 nodes (center and two rings).
     """
     if n_nodes < 19:
         raise ValueError(f"n_nodes = {n_nodes}: expected at least 19")

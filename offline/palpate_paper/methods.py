@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.lti.block_form import diagonalise
+from palpate.lti.block_form import diagonalize
 from palpate.lti.pole_residue import DiagonalSystem
 from palpate.reduction import (
     ReducedSystem,
@@ -33,7 +33,7 @@ class Method:
 
     name: str
     label: str
-    colour: str
+    color: str
     marker: str
     apply: Apply
     marker_size: int = 4
@@ -42,10 +42,10 @@ class Method:
     def style(self) -> dict[str, Any]:
         """For plots of all methods: what another may cover is larger, with an open marker and a wider line."""
         return {
-            "color": self.colour,
+            "color": self.color,
             "marker": self.marker,
             "markersize": self.marker_size,
-            "markerfacecolor": "none" if self.marker_size > 4 else self.colour,
+            "markerfacecolor": "none" if self.marker_size > 4 else self.color,
             "linewidth": self.marker_size / 4,
             "label": self.label,
         }
@@ -126,7 +126,7 @@ def reduce_by(method: Method, system: DiagonalSystem, band_hz: Band, order: int)
     except ReductionError:
         return None
     plain = reduced.system
-    diagonal = plain if isinstance(plain, DiagonalSystem) else diagonalise(plain.a, plain.b, plain.c, plain.d)
+    diagonal = plain if isinstance(plain, DiagonalSystem) else diagonalize(plain.a, plain.b, plain.c, plain.d)
     seconds = time.perf_counter() - start
     return Reduced(
         method, reduced.order, diagonal, reduced.error_bound, reduced.hankel_singular_values, seconds

@@ -9,7 +9,7 @@ from typing import Any
 
 from palpate.lti.frequencies import band_frequencies
 from palpate.lti.sampling import sample
-from palpate.reduction.evidence import hinf_error, in_band_error
+from palpate.reduction.accuracy import hinf_error, in_band_error
 from palpate.reduction.passivity import passivity_margin
 from palpate_paper.examples import PERIOD_S, Example
 from palpate_paper.figure import Cell, Figure, tidy

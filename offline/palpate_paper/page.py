@@ -9,7 +9,7 @@ from palpate_paper.examples import DISC_DRAG_PER_S
 from palpate_paper.figure import Figure
 
 _PAPER: dict[int, str] = {
-    2: "The deflection of the disc's centre by PCMFS with 500 nodes and by 146 linear triangular finite elements.",
+    2: "The deflection of the disc's center by PCMFS with 500 nodes and by 146 linear triangular finite elements.",
     3: 'Convergence in the L2 norm of PCMFS and finite elements; PCMFS is "clearly less accurate" at the same number of nodes. '
     "No orders are stated.",
     4: "600 of 800 states. TBR captures most of the dynamics; Hankel-optimal has a steady error at high frequencies; modal "
@@ -46,7 +46,7 @@ This page is written by `palpate reproduce --out docs`, numbers included; every 
 - **States.** The paper counts two states a degree of freedom. The memory of the material (Eq. 9) is a third one in our exact
   system; the tables give both counts.
 - **Node counts.** 500 nodes in rings of about 2πk nodes (a polar grid with equally many nodes on each ring fails near the
-  centre), 15 x 15 nodes instead of 200 on the square so that one lies in the middle, and 10³ on the cube with the four nodes
+  center), 15 x 15 nodes instead of 200 on the square so that one lies in the middle, and 10³ on the cube with the four nodes
   around the middle of the top as the tip.
 - **Damping of the disc.** Its material is purely elastic: all poles lie on the imaginary axis, no Gramian exists, and
   neither TBR nor HOM is defined. We add a drag of {DISC_DRAG_PER_S:g} /s (ρ (u″ + c u′)), which takes {100 * (1 - 2.718281828 ** (-DISC_DRAG_PER_S)):.1g} % of a wave's amplitude in the
@@ -59,10 +59,10 @@ This page is written by `palpate reproduce --out docs`, numbers included; every 
   studied with the same input spread over a smooth spot; the reductions use the single node as the paper does.
 - **Round-off.** Errors below 1e-9 % are round-off, whatever the bound says; where an order is above what round-off leaves, the
   reduction stops there, and the tables show the order that it reached.
-- **Discretisation.** Figures 4 to 14 use our `conservative` discretisation, which is symmetric, stable and passive; figure 15 has the
+- **Discretization.** Figures 4 to 14 use our `conservative` discretization, which is symmetric, stable and passive; figure 15 has the
   paper's collocation beside it.
 - **Solution time.** Reduced models run as real 2 x 2 blocks in one compiled loop, 1 ms a step; processor time, the median of five
-  runs. The full model runs in the same loop with all its modes, and by Newmark's method with one sparse factorisation (SuperLU
+  runs. The full model runs in the same loop with all its modes, and by Newmark's method with one sparse factorization (SuperLU
   through SciPy, some tens of µs of interpreter a step). Reductions are timed once by the wall clock, beside other
   work: differences below a factor of two are the machine's.
 """

@@ -44,10 +44,10 @@ def reaction_force(study: Study) -> Figure:
         styles = ("-", "-", "-", "--")
         for model, force, style in zip(models, forces, styles, strict=False):
             label = f"{model.method.name}, {model.order}"
-            colour = model.method.colour
-            left.plot(times, force, color=colour, linewidth=1, linestyle=style, label=label)
+            color = model.method.color
+            left.plot(times, force, color=color, linewidth=1, linestyle=style, label=label)
             error = np.maximum(np.abs(force - full.exact) / largest, 1e-12)
-            right.semilogy(times, error, color=colour, linewidth=0.8, linestyle=style, label=label)
+            right.semilogy(times, error, color=color, linewidth=0.8, linestyle=style, label=label)
         newmark = np.maximum(np.abs(full.newmark - full.exact) / largest, 1e-12)
         right.semilogy(times, newmark, color="black", linewidth=0.8, linestyle=":", label="Newmark")
         left.set(xlabel="time, s", ylabel="reaction force, N", title="force")

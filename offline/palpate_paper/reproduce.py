@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Protocol
 
 from palpate.plots import require_matplotlib
-from palpate_paper import convergence, discretisations, errors_and_times, frequency_responses, orders
-from palpate_paper.centre_displacement import centre_displacement
+from palpate_paper import convergence, discretizations, errors_and_times, frequency_responses, orders
+from palpate_paper.center_displacement import center_displacement
 from palpate_paper.figure import Figure
 from palpate_paper.page import write_page
 from palpate_paper.reaction_force import reaction_force
 from palpate_paper.study import Study
 
 FIGURES: dict[int, Callable[[Study], Figure]] = {
-    2: centre_displacement,
+    2: center_displacement,
     3: convergence.disc,
     4: lambda study: frequency_responses.frequency_response(study, study.disc, 4),
     5: lambda study: errors_and_times.error_and_time(study, study.disc, 5),
@@ -28,7 +28,7 @@ FIGURES: dict[int, Callable[[Study], Figure]] = {
     12: lambda study: errors_and_times.error_and_time(study, study.cube, 12),
     13: errors_and_times.products,
     14: orders.error_against_order,
-    15: discretisations.both_discretisations,
+    15: discretizations.both_discretizations,
     16: orders.passivity,
 }
 """Those of the paper by its numbers (figure 1 is a sketch), then ours."""

@@ -38,7 +38,7 @@ def step_through(model: StateSpace, inputs: Array) -> Array:
 def median_seconds(run: Callable[[], object], repeats: int = 5) -> float:
     """Median processor time of a few runs of one thread, s, after one that is not counted (compilation, caches).
 
-    Processor time, because wall time on a busy machine measures its neighbours.
+    Processor time, because wall time on a busy machine measures its neighbors.
     """
     run()
     times = []

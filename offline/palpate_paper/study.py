@@ -15,7 +15,7 @@ from palpate.lti.frequencies import (
     spectral_norms,
 )
 from palpate.lti.pole_residue import DiagonalSystem
-from palpate.reduction.evidence import hinf_error, in_band_error
+from palpate.reduction.accuracy import hinf_error, in_band_error
 from palpate_paper.examples import PERIOD_S, Example, cube, disc, square
 from palpate_paper.full_solution import FullSolution, solve_in_full
 from palpate_paper.methods import OF_THE_PAPER, Method, Reduced, reduce_by

@@ -75,7 +75,7 @@ def newmark(
     *,
     observed: ArrayLike | Sequence[int] = (),
 ) -> TimeHistory:
-    """Newmark's average acceleration (beta 1/4, gamma 1/2), one factorisation, second order in the step.
+    """Newmark's average acceleration (beta 1/4, gamma 1/2), one factorization, second order in the step.
 
     The stress memories follow Eq. 24: q_j+ = e^(-dt/tau_j) q_j + gamma_j Q_j (sigma_0+ - sigma_0) with
     Q_j = (1 - e^(-dt/tau_j)) / (dt/tau_j), so the step solves (4/dt² mass + (1 + sum gamma_j Q_j) elastic + algebraic).

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from palpate.lti.pole_residue import full_system
 from palpate.model_file import ReducedModel, load_model
 from palpate.plots import Touch
-from palpate.reduction.evidence import step_through
+from palpate.reduction.accuracy import step_through
 from palpate_server.diagnostics.round_trips import free_endpoint
 from palpate_server.recording.replay import read_session
 
@@ -113,12 +113,12 @@ def test_the_served_force_is_the_full_models_within_the_error_that_the_file_stat
     difference = touch.in_band((touch.force_n - touch.force_full_n)[:, 3:] * steady[:, None], model)
     frequencies = np.fft.rfftfreq(len(touch.time_s), model.period_s)
     spectrum = np.fft.rfft(touch.displacement_m, axis=0)
-    in_band = frequencies <= model.evidence.band_hz[1]
+    in_band = frequencies <= model.accuracy.band_hz[1]
     gain = np.linalg.norm(full.transfer(2j * np.pi * frequencies[in_band]), 2, axis=(1, 2))
     felt = gain * np.linalg.norm(spectrum[in_band], axis=1)
     weights = np.where(frequencies[in_band] == 0, 1.0, 2.0)  # both signs of the frequency
     energy = np.sum(weights * felt**2) / len(touch.time_s)
-    assert np.sum(difference**2) <= model.evidence.error_in_band**2 * energy
+    assert np.sum(difference**2) <= model.accuracy.error_in_band**2 * energy
 
 
 def test_the_stated_time_domain_error_is_found_again_from_the_file_alone(
@@ -131,4 +131,4 @@ def test_the_stated_time_domain_error_is_found_again_from_the_file_alone(
     exact = full.response(press, model.period_s)
     served = step_through(model.discrete, press)
     error = np.max(np.linalg.norm(served - exact, axis=1)) / np.max(np.linalg.norm(exact, axis=1))
-    assert error <= max(model.evidence.error_in_band, model.evidence.error_time_domain)
+    assert error <= max(model.accuracy.error_in_band, model.accuracy.error_time_domain)

@@ -455,7 +455,7 @@ def test_describe_and_geometry_say_what_the_model_is(
         assert description["limits"]["max_force_n"] == 3.5
         assert description["surface_period_s"] == 1 / 60
         assert [contact["name"] for contact in description["contacts"]] == ["tip"]
-        assert description["model"]["evidence"]["band_hz"] == [0.0, 30.0]
+        assert description["model"]["accuracy"]["band_hz"] == [0.0, 30.0]
         _, geometry = client.query("geometry")
         vertices = np.frombuffer(geometry["vertices_m"], "<f4").reshape(-1, 3)
         np.testing.assert_array_equal(vertices, surface.vertices.astype(np.float32))

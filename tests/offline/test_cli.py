@@ -57,8 +57,8 @@ def test_inspect_prints_what_the_file_states(slab: tuple[Path, str]) -> None:
     assert summary["n_nodes"] == 7 * 7 * 4
     assert summary["period_s"] == 1e-3
     assert summary["order"] < summary["n_states_full"]
-    assert summary["evidence"]["error_in_band"] <= 0.02
-    assert summary["evidence"]["error_bound"] is None
+    assert summary["accuracy"]["error_in_band"] <= 0.02
+    assert summary["accuracy"]["error_bound"] is None
     assert palpate("inspect", "slab.npz", folder=folder).returncode == 0
 
 
@@ -72,7 +72,7 @@ def test_the_same_configuration_builds_the_same_evidence(slab: tuple[Path, str])
     (folder / "again.npz").unlink()
     assert first["config_sha256"] == second["config_sha256"]
     assert first["order"] == second["order"]
-    assert first["evidence"]["error_in_band"] == pytest.approx(second["evidence"]["error_in_band"], rel=0.05)
+    assert first["accuracy"]["error_in_band"] == pytest.approx(second["accuracy"]["error_in_band"], rel=0.05)
 
 
 @pytest.mark.parametrize("method", ["tbr", "modal", "modal-static"])
@@ -86,7 +86,7 @@ def test_method_and_order_can_be_chosen_on_the_command_line(slab: tuple[Path, st
     (folder / f"{method}.npz").unlink()
     assert summary["method"] == method
     assert summary["order"] <= 30
-    assert (summary["evidence"]["error_bound"] is not None) == (method == "tbr")
+    assert (summary["accuracy"]["error_bound"] is not None) == (method == "tbr")
 
 
 @pytest.mark.parametrize(

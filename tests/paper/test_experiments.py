@@ -18,7 +18,7 @@ from palpate_paper.examples import (
     CUBE_MATERIAL,
     PERIOD_S,
     SQUARE_PRONY,
-    centre_of,
+    center_of,
     pulse,
     square,
     with_drag,
@@ -106,7 +106,7 @@ def test_the_series_of_the_square_satisfies_the_boundary_and_has_the_spots_mean(
 
 def test_drag_adds_c_s_to_every_mode() -> None:
     cloud = disc_membrane(60)
-    modes = membrane.conservative_modes(cloud, [centre_of(cloud)])
+    modes = membrane.conservative_modes(cloud, [center_of(cloud)])
     system = with_drag(modes, 0.3)
     s = np.array([0.1 + 2j, 3j, 1.0])
     b = modes.input_coupling[:, 0]
@@ -289,7 +289,7 @@ def test_the_ranking_follows_the_numbers_and_says_what_is_equal() -> None:
 
     assert ranking({"HOM": 3.0, "MT": 1.0, "TBR": 2.0}, text) == "MT (1) < TBR (2) < HOM (3)"
     assert ranking({"HOM": 1.05, "MT": 1.0}, text) == "MT (1) ≈ HOM (1.05)"
-    # Equal to the least of a group, not to the neighbour: a chain of small steps is no equality.
+    # Equal to the least of a group, not to the neighbor: a chain of small steps is no equality.
     assert ranking({"HOM": 1.9, "MT": 1.0, "TBR": 3.0}, text, 2.0) == "MT (1) ≈ HOM (1.9) < TBR (3)"
     assert [m.name for m in OF_THE_PAPER] == ["HOM", "MT", "TBR"]
 

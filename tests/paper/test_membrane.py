@@ -58,8 +58,8 @@ def test_the_linear_basis_does_not_converge_by_collocation():
 @pytest.mark.parametrize("method", METHODS)
 def test_the_papers_membranes_are_stable_with_memory_and_a_tip_in_the_middle(method, build, n):
     cloud = build(n)
-    centre = cloud.points[cloud.on_edge].mean(axis=0)
-    distance = np.linalg.norm(cloud.points - centre, axis=1)
+    center = cloud.points[cloud.on_edge].mean(axis=0)
+    distance = np.linalg.norm(cloud.points - center, axis=1)
     modes = METHODS[method](cloud, [np.flatnonzero(distance < distance.min() + 1e-9)])
     judged = stability(modes, PronySeries((1.0,), (1.0,)))
     assert judged.growing_modes == 0

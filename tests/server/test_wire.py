@@ -103,7 +103,7 @@ def test_any_value_in_any_field_gives_a_whole_command_or_a_reason(
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_numbers_that_are_not_finite_are_recognised(bad: float) -> None:
+def test_numbers_that_are_not_finite_are_recognized(bad: float) -> None:
     for axis in range(3):
         vector = [0.0, 0.0, 0.0]
         vector[axis] = bad
@@ -113,7 +113,7 @@ def test_numbers_that_are_not_finite_are_recognised(bad: float) -> None:
 
 @pytest.mark.parametrize("field", ["displacement_m", "velocity_m_per_s"])
 @pytest.mark.parametrize(("value", "in_range"), [(1e3, True), (1000.1, False), (1.797e308, False)])
-def test_numbers_that_no_device_gives_are_recognised(field: str, value: float, in_range: bool) -> None:
+def test_numbers_that_no_device_gives_are_recognized(field: str, value: float, in_range: bool) -> None:
     for axis in range(3):
         for sign in (-1.0, 1.0):
             vector = [0.0, 0.0, 0.0]
@@ -212,7 +212,7 @@ def _named(node: ast.expr, name: str) -> bool:
 
 def test_the_page_lists_exactly_the_reasons_for_which_a_query_is_refused() -> None:
     raised: set[str] = set()
-    for file in ("control.py", "leases.py", "recorder.py", "service.py"):
+    for file in ("session/requests.py", "session/leases.py", "recording/recorder.py", "session/state.py"):
         raised |= _texts(call.args[0] for call in _calls(file) if _named(call.func, "Refused"))
     raised |= _texts(call.args[1] for call in _calls("server.py") if _named(call.func, "_refuse"))
     assert raised == set(wire.NOT_GRANTED)
@@ -221,7 +221,7 @@ def test_the_page_lists_exactly_the_reasons_for_which_a_query_is_refused() -> No
 
 def test_the_page_lists_exactly_the_fields_that_control_requests_have() -> None:
     read: set[str] = set()
-    for call in _calls("control.py"):
+    for call in _calls("session/requests.py"):
         is_get = isinstance(call.func, ast.Attribute) and _named(call.func.value, "request")
         if is_get or (call.args and _named(call.args[0], "request")):
             read |= _texts(call.args)

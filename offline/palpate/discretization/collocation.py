@@ -1,4 +1,4 @@
-"""The discretisation of BaniHani & De 2009: momentum at interior nodes, traction at free boundary nodes (Eq. 11-14, 30-33).
+"""The discretization of BaniHani & De 2009: momentum at interior nodes, traction at free boundary nodes (Eq. 11-14, 30-33).
 
 Nonsymmetric, so its modes are complex and may grow: look at `stability` before trusting a model. Linear consistency is
 order 0 for second derivatives, so on scattered nodes it does not converge. It is here for the paper's examples and for
@@ -41,7 +41,7 @@ def elastic_modes(
     patch is traction times tributary area, summed over its nodes. Dense: 3 n_interior unknowns, nonsymmetric.
 
     Raises ValueError when the arguments are inconsistent or a patch node is not on the boundary, SupportError when a
-    node has too few neighbours.
+    node has too few neighbors.
     """
     held, interior, surface = _partition(cloud, fixed, contacts)
     operators = Operators(cloud, material, support_radius_factor)

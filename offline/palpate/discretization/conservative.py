@@ -43,7 +43,7 @@ def elastic_modes(
     """All modes of the body that is held at the nodes `fixed` and driven at the patches `contacts` (node indices each).
 
     Dense: 3 n_free unknowns, n_free³ work. Raises ValueError when the arguments are inconsistent, SupportError when a
-    node has too few neighbours, MemoryError when the cloud is too large for all its modes.
+    node has too few neighbors, MemoryError when the cloud is too large for all its modes.
     """
     held = supports(cloud.n_nodes, fixed, contacts)
     _require_volumes(cloud)

@@ -26,7 +26,7 @@ class NodalValues:
     """The map U = H⁻¹ u from nodal values to the parameters of the shape functions, which do not interpolate.
 
     In nodal values a prescribed displacement is a row, and the mass is diagonal. H is (n_nodes, n_nodes), well
-    conditioned, and factorised once.
+    conditioned, and factorized once.
     """
 
     def __init__(self, value: csr_array) -> None:

@@ -13,11 +13,11 @@ from palpate.scene.material import PronySeries
 
 @dataclass(frozen=True)
 class Stability:
-    """What to know about a discretisation before reducing it.
+    """What to know about a discretization before reducing it.
 
     growing_modes           number of modes with a pole right of the imaginary axis, beyond round-off
     spectral_abscissa_per_s largest real part of all poles, 1/s
-    largest_imaginary_part  largest |Im mu| / |mu| of the squared frequencies mu; 0 for a symmetric discretisation
+    largest_imaginary_part  largest |Im mu| / |mu| of the squared frequencies mu; 0 for a symmetric discretization
     curing_damping_per_s    smallest c, 1/s, with which rho (u'' + c u') lets every elastic mode decay,
                             infinite when one diverges statically (Re mu <= 0)
     """

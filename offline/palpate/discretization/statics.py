@@ -1,4 +1,4 @@
-"""Tip stiffness of the conservative discretisation without its modes, for clouds too large for them."""
+"""Tip stiffness of the conservative discretization without its modes, for clouds too large for them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def static_stiffness(
 
     Conjugate gradients in the nodal values: the stiffness is only ever applied, through the sparse gradient and the
     sparse LU factor of H. The preconditioner is one component's Laplacian, held at the same nodes by a penalty and
-    factorised once: elasticity differs from three of them by a factor that the spacing does not enter. Raises as
+    factorized once: elasticity differs from three of them by a factor that the spacing does not enter. Raises as
     `conservative.elastic_modes`, and RuntimeError when the iteration does not converge.
     """
     held = supports(cloud.n_nodes, fixed, contacts)

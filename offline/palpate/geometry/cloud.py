@@ -33,7 +33,7 @@ class NodeCloud:
     areas    (n_nodes,), m²; zero at interior nodes, they sum to the body's surface
     tags     (n_nodes,), 0 inside, k >= 1 on piece k of the boundary (a box: 1..6 for
              x-, x+, y-, y+, z-, z+; bodies with one smooth boundary: 1)
-    spacing  (n_nodes,), m; local distance between neighbouring nodes, from which the support radius follows
+    spacing  (n_nodes,), m; local distance between neighboring nodes, from which the support radius follows
     surface  the body's boundary, for a view
     """
 

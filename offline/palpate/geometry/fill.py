@@ -156,7 +156,7 @@ def _spread(
 
 
 def _fitted(patch: Refinement, surface: TriangleSurface) -> Refinement:
-    """The patch moved to the surface point nearest to its centre, its spacing (reduced) such that its rings fit."""
+    """The patch moved to the surface point nearest to its center, its spacing (reduced) such that its rings fit."""
     closest, _ = closest_point(np.array([patch.center_m]), surface.vertices, surface.triangles)
     x, y, z = closest[0].tolist()
     spacing = patch.radius_m / (_n_rings(patch) + 0.5)
@@ -185,33 +185,33 @@ def _patches(surface: TriangleSurface, field: SpacingField) -> Array:
 
 
 def _rings(surface: TriangleSurface, patch: Refinement) -> Array:
-    """(n, 3): a fitted patch's centre, its rings, and one ring beyond its radius, with 6 k nodes on ring k, m.
+    """(n, 3): a fitted patch's center, its rings, and one ring beyond its radius, with 6 k nodes on ring k, m.
 
-    A ring's nodes are the points of the surface at its distance from the centre, found by going back and forth
+    A ring's nodes are the points of the surface at its distance from the center, found by going back and forth
     between sphere and surface.
     """
     vertices, triangles = surface.vertices, surface.triangles
-    centre = np.array([patch.center_m])
-    _, triangle = closest_point(centre, vertices, triangles)
+    center = np.array([patch.center_m])
+    _, triangle = closest_point(center, vertices, triangles)
     normal = triangle_normals(surface)[0][triangle[0]]
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)
-    nodes = [centre]
+    nodes = [center]
     for k in range(1, _n_rings(patch) + 2):
         radius = k * patch.spacing_m
         angle = 2 * np.pi * (np.arange(6 * k) + 0.5 * (k % 2)) / (6 * k)
-        ring = centre + radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
+        ring = center + radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
         for _ in range(100):
             ring, _ = closest_point(ring, vertices, triangles)
-            arm = ring - centre
+            arm = ring - center
             distance = np.linalg.norm(arm, axis=1, keepdims=True)
             if np.all(np.abs(distance - radius) <= 1e-9 * radius):
                 break
-            ring = centre + arm * (radius / np.where(distance > 0, distance, 1.0))
+            ring = center + arm * (radius / np.where(distance > 0, distance, 1.0))
         else:
             raise ValueError(
-                f"a round patch of radius {patch.radius_m} m finds no place around {centre[0].tolist()} m: "
+                f"a round patch of radius {patch.radius_m} m finds no place around {center[0].tolist()} m: "
                 "expected a smaller radius, or a place where the surface is larger and smoother"
             )
         nodes.append(ring)

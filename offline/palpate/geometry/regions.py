@@ -115,7 +115,7 @@ def contact_patch(point_m: Vector, radius_m: float, cloud: NodeCloud) -> Contact
     distance = np.linalg.norm(cloud.points[candidates] - center, axis=1)
     nodes = candidates[distance <= radius_m + _EDGE * cloud.spacing[candidates]]
     if len(nodes) == 0:
-        nearest = f"{distance.min():.4g} m from its centre" if len(candidates) else "nowhere"
+        nearest = f"{distance.min():.4g} m from its center" if len(candidates) else "nowhere"
         raise RegionError(
             f"the contact patch of radius_m = {radius_m} around {center.tolist()} m holds no boundary node: the "
             f"nearest is {nearest}, expected a larger radius or a smaller node spacing there"

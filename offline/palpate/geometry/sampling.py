@@ -99,22 +99,22 @@ def sample_inside(surface: TriangleSurface, field: SpacingField, fineness: float
     size = 8 * fineness * field.spacing_m
     counts = np.ceil((high - low) / size).astype(int)
     index = np.indices(tuple(int(n) for n in counts)).reshape(3, -1).T
-    centres = (low + high) / 2 + (index - (counts - 1) / 2) * size
+    centers = (low + high) / 2 + (index - (counts - 1) / 2) * size
     octants = (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) / 2
-    depth = np.full(len(centres), -np.inf)
+    depth = np.full(len(centers), -np.inf)
     done: list[tuple[Array, Array, Array]] = []
-    while len(centres):
+    while len(centers):
         # From its parent a cell knows a depth that it has at least: only those near the surface need their own.
         reach = size * np.sqrt(3) / 2
         unsure = depth < reach
-        depth[unsure] = depth_inside(centres[unsure], surface)
+        depth[unsure] = depth_inside(centers[unsure], surface)
         near = depth > -reach
-        centres, depth, h = centres[near], depth[near], field(centres[near])
+        centers, depth, h = centers[near], depth[near], field(centers[near])
         small = size <= fineness * h * (1 + 1e-9)
         share = np.clip(0.5 + depth / size, 0.0, 1.0)
         leaf = small & (share > 0)
-        done.append((centres[leaf], share[leaf] * size**3, h[leaf]))
-        centres = (centres[~small, None, :] + size * octants).reshape(-1, 3)
+        done.append((centers[leaf], share[leaf] * size**3, h[leaf]))
+        centers = (centers[~small, None, :] + size * octants).reshape(-1, 3)
         depth = np.repeat(depth[~small] - reach / 2, 8)
         size /= 2
     return Samples(*(np.concatenate(column) for column in zip(*done, strict=True)))

@@ -164,7 +164,7 @@ def _spiral(count: int) -> Array:
 
 
 def _grid_in_ball(radius: float, step: float, offset: float) -> Array:
-    """(n, 3), points (i + offset) step within the radius; offset 0 has a point at the centre."""
+    """(n, 3), points (i + offset) step within the radius; offset 0 has a point at the center."""
     reach = int(np.ceil(radius / step)) + 1
     axis = (np.arange(-reach, reach + 1) + offset) * step
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)

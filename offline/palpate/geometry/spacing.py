@@ -14,12 +14,12 @@ Array = NDArray[np.float64]
 class Refinement:
     """A ball within which nodes lie closer together.
 
-    center_m   its centre, m
+    center_m   its center, m
     radius_m   > 0, m
     spacing_m  > 0, distance of the nodes within, m
-    growth     0 < growth <= 0.5, by how much the distance grows for every metre away from the ball. A rigid punch
-               on the ball, with the conservative discretisation, is 1-3 % off up to 0.3, 5 % at 0.4, 35 % at 0.5.
-    rings      lay out a round patch: move the ball to the surface point nearest to its centre and put its surface
+    growth     0 < growth <= 0.5, by how much the distance grows for every meter away from the ball. A rigid punch
+               on the ball, with the conservative discretization, is 1-3 % off up to 0.3, 5 % at 0.4, 35 % at 0.5.
+    rings      lay out a round patch: move the ball to the surface point nearest to its center and put its surface
                nodes there and on rings around it, at most `spacing_m` apart. The circle of `radius_m` runs midway
                between two rings, so that the nodes within stand for a disc of this very radius: with a node ring
                on the circle itself a punch acts as if half a spacing larger.

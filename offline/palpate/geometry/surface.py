@@ -25,7 +25,7 @@ class SurfaceError(ValueError):
 def load_surface(path: Path, unit_m: float = 1.0) -> TriangleSurface:
     """Read a closed surface from an STL, OBJ or PLY file.
 
-    unit_m  length of the file's unit, m (0.001 for a file in millimetres)
+    unit_m  length of the file's unit, m (0.001 for a file in millimeters)
 
     Vertices at the very same place are merged (an STL file repeats them) and unused ones dropped.
     Raises FileNotFoundError, and SurfaceError when the file can't be read or `check_surface` refuses it.

@@ -12,14 +12,14 @@ from palpate.model_file import StateSpace
 _LARGEST_CONDITION = 1e10  # beyond it the diagonal form keeps fewer than six digits
 
 
-def diagonalise(
+def diagonalize(
     a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], d: NDArray[np.float64]
 ) -> DiagonalSystem:
     """The diagonal form of dx/dt = A x + B u, y = C x + D u; a (n, n), b (n, m), c (p, n), d (p, m), real.
 
     Rows of b and columns of c have equal 2-norm where neither is zero. Poles ascend in modulus, each its own group.
 
-    Raises ReductionError where the eigenvectors' condition number is beyond 1e10: A is not diagonalisable in doubles.
+    Raises ReductionError where the eigenvectors' condition number is beyond 1e10: A is not diagonalizable in doubles.
     """
     poles, vectors = np.linalg.eig(a)
     vectors = vectors.astype(np.complex128)

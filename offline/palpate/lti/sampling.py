@@ -34,7 +34,7 @@ _NEAR_BAND = 1.5
 """Poles up to this many times the band's upper end are prewarped: further out a shift matters less than the residue's."""
 
 
-def discretise(
+def discretize(
     state_space: StateSpace, period_s: float, rule: SamplingRule = "first-order-hold", band_hz: float = 0.0
 ) -> StateSpace:
     """The state space sampled at period_s, in the running form y = C xi + D u, then xi+ = A xi + B u.

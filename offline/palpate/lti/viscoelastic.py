@@ -33,7 +33,7 @@ def viscoelastic_system(modes: ElasticModes, prony: PronySeries) -> DiagonalSyst
 
     Its groups are the relaxation of the static stiffness (0), then the modes by ascending |mu| (1, 2, ...); complex mu
     must come with their conjugates, of which one is kept. Where the body is symmetric (K_tt = K_tt^T, c = b^T), so is
-    the realisation: C = B^T.
+    the realization: C = B^T.
 
     Raises ValueError where a squared frequency is zero (the body is not held) or not finite, or lacks its conjugate,
     or where a mode is so exactly critically damped that two of its poles coincide.

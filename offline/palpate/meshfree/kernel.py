@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 CHUNK = 64
 """Points that share one set of work arrays: large enough to hide the allocation, small enough to balance threads."""
 
-# Sums over neighbours may be reordered (so that they vectorise); infinities and NaN keep their meaning.
+# Sums over neighbors may be reordered (so that they vectorize); infinities and NaN keep their meaning.
 REORDER = {"reassoc", "contract", "nsz"}
 
 
@@ -36,7 +36,7 @@ def evaluate(
 ) -> None:
     """Fill value (nnz,), first (dim, nnz) and second (dim (dim + 1) / 2, nnz); pivot (n_points,) tells regular supports.
 
-    With the basis p centred at the point and frozen there, h_J = w_J p_J^T c and A c = p, so differentiating A c = p
+    With the basis p centered at the point and frozen there, h_J = w_J p_J^T c and A c = p, so differentiating A c = p
     gives every derivative from the same Cholesky factor, with A's own derivatives only ever applied:
 
         A c_a  = p_a  - sum_J w_J,a g_J p_J                                       g_J  = p_J^T c

@@ -1,4 +1,4 @@
-"""The Laplacian from a local quadratic fit around every node, the weight centred there and frozen.
+"""The Laplacian from a local quadratic fit around every node, the weight centered there and frozen.
 
 Cheaper and more stable than the full second derivatives of the shape functions: no derivative of the weight enters, and
 nodal values are used as they are. (Generalised finite differences; "diffuse" derivatives of moving least squares.)
@@ -20,13 +20,13 @@ NEIGHBOURS = 12
 """With 12, rings and lattices have nearly real spectra; with 15 and more, complex pairs that grow appear."""
 
 REACH = 1.05
-"""Support radius over the distance to the last of the neighbours."""
+"""Support radius over the distance to the last of the neighbors."""
 
 
 def local_fit_laplacian(points: NDArray[np.float64]) -> csr_array:
     """(n_nodes, n_nodes), 1/m²: the Laplacian at the nodes of a plane cloud (n_nodes, 2), m, from the nodal values.
 
-    Exact for quadratics. Raises SupportError naming the node where the neighbours don't determine a quadratic.
+    Exact for quadratics. Raises SupportError naming the node where the neighbors don't determine a quadratic.
     """
     n = len(points)
     tree = cKDTree(points)

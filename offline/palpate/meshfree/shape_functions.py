@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from palpate.meshfree.kernel import evaluate
-from palpate.meshfree.neighbours import covering_nodes
+from palpate.meshfree.neighbors import covering_nodes
 
 SMALLEST_PIVOT = 1e-8
 """Below this relative Cholesky pivot of the moment matrix half of the digits are lost: the support counts as degenerate."""

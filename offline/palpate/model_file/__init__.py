@@ -116,7 +116,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class AccuracyReport:
     """How good the reduced model is, measured against the full one. Relative errors are fractions.
 
     error_in_band          largest over the band of |F_full - F| / |F_full| (2-norms, at each frequency), F being the
@@ -180,7 +180,7 @@ class ReducedModel:
     full: PoleResidueSystem
     static_stiffness: Array
     surface: Surface
-    evidence: Evidence
+    accuracy: AccuracyReport
     config: str
     config_sha256: str
     built_with: str
@@ -195,8 +195,8 @@ class ReducedModel:
 
     def summary(self) -> dict[str, Any]:
         """What `palpate inspect --json` prints: plain numbers, lists and strings."""
-        evidence = asdict(self.evidence)
-        evidence["hankel_singular_values"] = self.evidence.hankel_singular_values.tolist()
+        accuracy = asdict(self.accuracy)
+        accuracy["hankel_singular_values"] = self.accuracy.hankel_singular_values.tolist()
         return {
             "format": FORMAT,
             "schema_version": SCHEMA_VERSION,
@@ -214,7 +214,7 @@ class ReducedModel:
             "units": UNITS,
             "config_sha256": self.config_sha256,
             "built_with": self.built_with,
-            "evidence": evidence,
+            "accuracy": accuracy,
         }
 
 
@@ -244,7 +244,7 @@ def save_model(model: ReducedModel, path: Path) -> None:
         "n_nodes": model.n_nodes,
         "n_states_full": model.n_states_full,
         "contacts": [asdict(c) for c in model.contacts],
-        "evidence": {k: v for k, v in asdict(model.evidence).items() if k != "hankel_singular_values"},
+        "accuracy": {k: v for k, v in asdict(model.accuracy).items() if k != "hankel_singular_values"},
         "config": model.config,
         "config_sha256": model.config_sha256,
         "built_with": model.built_with,
@@ -252,7 +252,7 @@ def save_model(model: ReducedModel, path: Path) -> None:
     arrays: dict[str, NDArray[Any]] = {
         "metadata": np.frombuffer(json.dumps(scalars, allow_nan=False).encode(), dtype=np.uint8),
         "static_stiffness": model.static_stiffness,
-        "hankel_singular_values": model.evidence.hankel_singular_values,
+        "hankel_singular_values": model.accuracy.hankel_singular_values,
     }
     for group in ("continuous", "discrete", "full", "surface"):
         part = getattr(model, group)
@@ -314,11 +314,11 @@ def _assemble(arrays: dict[str, NDArray[Any]]) -> ReducedModel:
         n_vertices = _count(arrays, "surface_vertices")
         n_triangles = _count(arrays, "surface_triangles")
         n_poles = _count(arrays, "full_poles")
-        expected = [f.name for f in fields(Evidence) if f.name != "hankel_singular_values"]
-        missing = [name for name in expected if name not in scalars["evidence"]]
+        expected = [f.name for f in fields(AccuracyReport) if f.name != "hankel_singular_values"]
+        missing = [name for name in expected if name not in scalars["accuracy"]]
         if missing:
-            raise ModelFileError(f"field 'evidence.{missing[0]}' is missing")
-        evidence_fields = {name: _numbers(name, scalars["evidence"][name]) for name in expected}
+            raise ModelFileError(f"field 'accuracy.{missing[0]}' is missing")
+        evidence_fields = {name: _numbers(name, scalars["accuracy"][name]) for name in expected}
         model = ReducedModel(
             name=str(scalars["name"]),
             method=str(scalars["method"]),
@@ -341,7 +341,7 @@ def _assemble(arrays: dict[str, NDArray[Any]]) -> ReducedModel:
                 output=_take(arrays, "surface_output", (3 * n_vertices, order), np.float32),
                 feedthrough=_take(arrays, "surface_feedthrough", (3 * n_vertices, channels), np.float32),
             ),
-            evidence=Evidence(
+            accuracy=AccuracyReport(
                 **evidence_fields,
                 hankel_singular_values=_take(
                     arrays, "hankel_singular_values", (_count(arrays, "hankel_singular_values"),), np.float64
@@ -366,12 +366,12 @@ def _refuse_constant(text: str) -> None:
 
 
 def _numbers(name: str, value: Any) -> Any:
-    """A number of the evidence, None where there is no bound, or the band's two."""
+    """A number of the accuracy, None where there is no bound, or the band's two."""
     if name == "error_bound" and value is None:
         return None
     values = value if name == "band_hz" else [value]
     if not (isinstance(values, list) and all(type(v) in (int, float) for v in values)):
-        raise ModelFileError(f"field 'evidence.{name}' is {value!r}: expected a number")
+        raise ModelFileError(f"field 'accuracy.{name}' is {value!r}: expected a number")
     if name == "band_hz":
         low, high = values
         return float(low), float(high)

@@ -1,4 +1,4 @@
-"""The elastic modes of a supported body seen from its contact patches: what a discretisation hands to the reduction."""
+"""The elastic modes of a supported body seen from its contact patches: what a discretization hands to the reduction."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ElasticModes:
     so force(s) = h(s) [K_tt - sum_k c_k b_k^T h(s) / (s² + mu_k h(s))] u(s). The patch's own inertia is dropped.
 
     squared_frequencies  (n_modes,), (rad/s)²; real and ascending for `conservative`, else complex, ascending in size
-    input_coupling       (n_modes, n_inputs), b_k, mass-normalised
+    input_coupling       (n_modes, n_inputs), b_k, mass-normalized
     output_coupling      (n_outputs, n_modes), c_k; the transpose of input_coupling for `conservative`
     direct_stiffness     (n_outputs, n_inputs), K_tt, N/m at rest
     shapes               (3 n_nodes, n_modes), x, y, z of node 0, then of node 1, ...; m per unit q

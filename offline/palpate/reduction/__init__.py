@@ -1,8 +1,8 @@
-"""Reductions of linear systems, of viscoelastic bodies above all, and the evidence for them."""
+"""Reductions of linear systems, of viscoelastic bodies above all, and the accuracy report for them."""
 
 from palpate.lti.errors import ReductionError
-from palpate.lti.sampling import discretise
-from palpate.reduction.evidence import measure
+from palpate.lti.sampling import discretize
+from palpate.reduction.accuracy import measure
 from palpate.reduction.hankel_optimal import hankel_optimal
 from palpate.reduction.linear_system import LinearSystem
 from palpate.reduction.methods import METHODS, Method, Reduction, reduce
@@ -25,7 +25,7 @@ __all__ = [
     "SurfaceOutput",
     "balanced_truncation",
     "band_limited_truncation",
-    "discretise",
+    "discretize",
     "fit_surface_output",
     "hankel_optimal",
     "measure",

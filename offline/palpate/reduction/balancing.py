@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 NOISE_FLOOR = 1e-13
 
 
-class Realisation(Protocol):
+class Realization(Protocol):
     """What balancing needs of a system E dx/dt = A x + B u, y = C x + D u."""
 
     @property
@@ -67,8 +67,8 @@ class Balancing:
         largest = float(np.max(self.sigma, initial=0.0))
         return int(np.count_nonzero(self.sigma > NOISE_FLOOR * largest))
 
-    def truncated(self, system: Realisation, order: int) -> LinearSystem:
-        """The balanced realisation's first `order` states, 0 <= order <= rank."""
+    def truncated(self, system: Realization, order: int) -> LinearSystem:
+        """The balanced realization's first `order` states, 0 <= order <= rank."""
         scale = 1 / np.sqrt(self.sigma[:order])
         w = self.gramians.observe @ (self.left[:, :order] * scale)
         t = self.gramians.control @ (self.right[:, :order] * scale)
@@ -90,7 +90,7 @@ class Balancing:
         return value / float(self.sigma[0]) if self.rank else 0.0
 
 
-def balance(system: Realisation, gramians: Gramians) -> Balancing:
+def balance(system: Realization, gramians: Gramians) -> Balancing:
     """Singular value decomposition of observe^T E control (Tombs & Postlethwaite 1987)."""
     hankel = gramians.observe.T @ system.mass(gramians.control)
     if gramians.symmetric:  # eigenvalues do for singular values

@@ -37,7 +37,7 @@ def hankel_optimal(
     order      where sigma_r = sigma_{r+1}, or sigma_{r+1} is round-off, the next smaller order that is not so
     tolerance  sigma_{r+1} over sigma_1
 
-    Glover's all-pass embedding of the balanced realisation with Sigma = diag(Sigma_1, sigma I), Gamma = Sigma_1² - sigma² I
+    Glover's all-pass embedding of the balanced realization with Sigma = diag(Sigma_1, sigma I), Gamma = Sigma_1² - sigma² I
     and U with B_2 = -C_2^T U orthogonal:
         A^ = Gamma^-1 (sigma² A_11^T + Sigma_1 A_11 Sigma_1 - sigma C_1^T U B_1^T)
         B^ = Gamma^-1 (Sigma_1 B_1 + sigma C_1^T U),  C^ = C_1 Sigma_1 + sigma U B_1^T,  D^ = D - sigma U,
@@ -46,17 +46,17 @@ def hankel_optimal(
     Raises ReductionError where the embedding does not have exactly r stable poles (round-off).
     """
     part = prepare(system, order, tolerance, unstable)
-    balancing = balance(part.realisation, part.gramians())
+    balancing = balance(part.realization, part.gramians())
     sigma = balancing.sigma
     if balancing.rank == 0:
         return part.result(
-            "Hankel-optimal", balancing.truncated(part.realisation, 0), sigma, 2 * balancing.tail(0)
+            "Hankel-optimal", balancing.truncated(part.realization, 0), sigma, 2 * balancing.tail(0)
         )
     lossless = int(np.count_nonzero(sigma > _LOSSLESS * sigma[0]))
     largest_order = int(np.count_nonzero(sigma > _LEAST * sigma[0])) - 1
     orders = balancing.separated_orders(largest_order, _EQUAL)
     r = part.chosen_order(orders, lambda k: float(sigma[k] / sigma[0]))
-    full = balancing.truncated(part.realisation, lossless)
+    full = balancing.truncated(part.realization, lossless)
     equal = int(np.count_nonzero(np.abs(sigma[:lossless] - sigma[r]) <= _EQUAL * sigma[r]))
     reduced = _embedded(full, sigma[:lossless], r, equal)
     bound = float(sigma[r]) + 2 * balancing.tail(r + equal)

@@ -145,7 +145,7 @@ class LinearSystem:
         return self.c @ self.solutions(s) + self.d
 
     def solutions(self, s: NDArray[np.complexfloating[Any, Any]]) -> Complex:
-        """(n_points, n, n_inputs): (s E - A)^-1 B. One factorisation for all points if dense, one a point if sparse."""
+        """(n_points, n, n_inputs): (s E - A)^-1 B. One factorization for all points if dense, one a point if sparse."""
         out = np.empty((len(s), self.n_states, self.n_inputs), dtype=np.complex128)
         if self.n_states == 0:
             return out

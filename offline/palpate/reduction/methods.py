@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.lti.block_form import diagonalise, to_block_form
+from palpate.lti.block_form import diagonalize, to_block_form
 from palpate.lti.errors import ReductionError as ReductionError
 from palpate.lti.frequencies import band_frequencies, relative_errors
 from palpate.lti.pole_residue import DiagonalSystem
@@ -163,7 +163,7 @@ def _balanced(system: DiagonalSystem, gramians: Gramians) -> Family:
 
     def at(order: int) -> DiagonalSystem:
         reduced = balancing.truncated(form, order)
-        return diagonalise(reduced.a, reduced.b, reduced.c, reduced.d)
+        return diagonalize(reduced.a, reduced.b, reduced.c, reduced.d)
 
     return Family(np.arange(1, balancing.rank + 1), at, balancing)
 

@@ -20,11 +20,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.lti.block_form import diagonalise
+from palpate.lti.block_form import diagonalize
 from palpate.lti.errors import ReductionError
 from palpate.lti.frequencies import frequencies_near, relative_errors, spectral_norms
 from palpate.lti.pole_residue import DiagonalSystem
-from palpate.reduction.balancing import Balancing, Gramians, Realisation, balance
+from palpate.reduction.balancing import Balancing, Gramians, Realization, balance
 from palpate.reduction.gramians import (
     band_controllability_factor,
     band_quadrature,
@@ -90,10 +90,10 @@ def balanced_truncation(
     tolerance  bound over sigma_1; as sigma_1 is at most the largest |G - D|, the relative error is at most this, too
     """
     part = prepare(system, order, tolerance, unstable)
-    balancing = balance(part.realisation, part.gramians())
+    balancing = balance(part.realization, part.gramians())
     orders = np.arange(balancing.rank + 1)
     r = part.chosen_order(orders, lambda k: balancing.relative_to_largest(2 * balancing.tail(k)))
-    reduced = balancing.truncated(part.realisation, r)
+    reduced = balancing.truncated(part.realization, r)
     return part.result("balanced truncation", reduced, balancing.sigma, 2 * balancing.tail(r))
 
 
@@ -104,14 +104,14 @@ def singular_perturbation_balancing(
     *,
     unstable: Unstable = "refuse",
 ) -> ReducedSystem:
-    """The weak states of the balanced realisation follow at once instead of being dropped: exact statics.
+    """The weak states of the balanced realization follow at once instead of being dropped: exact statics.
 
     The bound is that of balanced truncation (Liu & Anderson 1989); tolerance as there. Nearly equal Hankel singular values
     are kept or dropped together: half of a lightly damped oscillator that follows at once has no meaning.
     """
     part = prepare(system, order, tolerance, unstable)
-    balancing = balance(part.realisation, part.gramians())
-    full = balancing.truncated(part.realisation, balancing.rank)
+    balancing = balance(part.realization, part.gramians())
+    full = balancing.truncated(part.realization, balancing.rank)
     orders = balancing.separated_orders(balancing.rank, _EQUAL)
     r = part.chosen_order(orders, lambda k: balancing.relative_to_largest(2 * balancing.tail(k)))
     a, b, c = full.a, full.b, full.c
@@ -146,12 +146,12 @@ def band_limited_truncation(
     part = prepare(system, order, tolerance, unstable)
     observe = part.gramians().observe  # first: it fails for a large sparse system that is not stable
     control = _band_factor(part.stable, (2 * math.pi * band_hz[0], 2 * math.pi * band_hz[1]))
-    balancing = balance(part.realisation, Gramians(control, observe))
+    balancing = balance(part.realization, Gramians(control, observe))
     if order is None:
-        r = _smallest_in_band(part.stable, part.realisation, balancing, band_hz, part.tolerance)
+        r = _smallest_in_band(part.stable, part.realization, balancing, band_hz, part.tolerance)
     else:
         r = part.chosen_order(np.arange(balancing.rank + 1), lambda k: math.inf)
-    reduced = balancing.truncated(part.realisation, r)
+    reduced = balancing.truncated(part.realization, r)
     return part.result("band-limited truncation", reduced, balancing.sigma, None)
 
 
@@ -176,7 +176,7 @@ def modal_truncation(
     part = prepare(system, order, tolerance, unstable)
     stable = part.stable
     if isinstance(stable, LinearSystem):
-        stable = diagonalise(stable.a, stable.b, stable.c, stable.d)
+        stable = diagonalize(stable.a, stable.b, stable.c, stable.d)
     ascending = np.argsort(np.abs(stable.poles), kind="stable")
     stable = stable.take(ascending)
     sizes = np.where(stable.is_pair, 2, 1)
@@ -209,7 +209,7 @@ class Prepared:
     tolerance: float
 
     @property
-    def realisation(self) -> Realisation:
+    def realization(self) -> Realization:
         return real_form(self.stable) if isinstance(self.stable, DiagonalSystem) else self.stable
 
     @property
@@ -346,21 +346,21 @@ def _band_factor(system: System, band: tuple[float, float]) -> Array:
 
 def _smallest_in_band(
     system: System,
-    realisation: Realisation,
+    realization: Realization,
     balancing: Balancing,
     band_hz: tuple[float, float],
     tolerance: float,
 ) -> int:
     if balancing.rank == 0:
         return 0  # the response is D in the whole band
-    lossless = balancing.truncated(realisation, balancing.rank)
+    lossless = balancing.truncated(realization, balancing.rank)
     omega = frequencies_near(system.poles if isinstance(system, DiagonalSystem) else lossless.poles, band_hz)
     full = system.transfer(1j * omega)
     best = (math.inf, 0)
 
     def attempt(order: int) -> bool | None:
         nonlocal best
-        reduced = balancing.truncated(realisation, order)
+        reduced = balancing.truncated(realization, order)
         error = float(np.max(relative_errors(full, reduced.transfer(1j * omega))))
         best = min(best, (error, order))
         return True if error <= tolerance and reduced.spectral_abscissa < 0 else None

@@ -82,7 +82,7 @@ class SurfaceGeometry(_Table):
     file_unit: Literal["m", "cm", "mm"] = "m"
     spacing_m: Positive
     growth: Number = Field(
-        default=0.3, gt=0, le=0.5, description="growth of the spacing per metre away from a refined contact"
+        default=0.3, gt=0, le=0.5, description="growth of the spacing per meter away from a refined contact"
     )
 
 
@@ -121,7 +121,7 @@ class ContactTable(_Table):
     """A patch of the surface that a tool tip holds and moves as one rigid piece."""
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,31}$")
-    point_m: Point = Field(description="the patch is centred at the surface point nearest to this")
+    point_m: Point = Field(description="the patch is centered at the surface point nearest to this")
     radius_m: Positive
     spacing_m: Positive | None = Field(
         default=None, description="node spacing on the patch; unset: unrefined"

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
-from palpate.model_file import Contact, Evidence, PoleResidueSystem, ReducedModel, StateSpace, Surface
+from palpate.model_file import AccuracyReport, Contact, PoleResidueSystem, ReducedModel, StateSpace, Surface
 
 
 def spring_mass_model(n_contacts: int = 1, n_modes: int = 4, period_s: float = 1e-3) -> ReducedModel:
     """Passive (sampled as well), quick to make, and with a known response.
 
-    F(s) = K u - sum_k p_k p_k^T / (s² + 2 zeta w_k s + w_k²) u with K > sum_k p_k p_k^T / w_k², discretised with
+    F(s) = K u - sum_k p_k p_k^T / (s² + 2 zeta w_k s + w_k²) u with K > sum_k p_k p_k^T / w_k², discretized with
     first-order hold.
     """
     random = np.random.default_rng(n_contacts + 100 * n_modes)
@@ -66,9 +66,9 @@ def spring_mass_model(n_contacts: int = 1, n_modes: int = 4, period_s: float = 1
         feedthrough=random.normal(size=(12, channels)).astype(np.float32),
     )
     # Nothing was reduced: every error is zero, whatever errors a model file comes to state.
-    nothing: dict[str, Any] = {field.name: 0.0 for field in fields(Evidence)}
+    nothing: dict[str, Any] = {field.name: 0.0 for field in fields(AccuracyReport)}
     abscissa = float(-damping * frequencies.min())
-    evidence = Evidence(
+    accuracy = AccuracyReport(
         **nothing
         | {
             "error_bound": None,
@@ -97,7 +97,7 @@ def spring_mass_model(n_contacts: int = 1, n_modes: int = 4, period_s: float = 1
         ),
         static_stiffness=stiffness - static_loss,
         surface=surface,
-        evidence=evidence,
+        accuracy=accuracy,
         config="",
         config_sha256="",
         built_with="palpate_server.diagnostics.sample_model",

@@ -56,7 +56,7 @@ def press(
     """The handle's position at the n ticks of the device, m from the surface and inwards, and velocity, m/s; (n, 2).
 
     reach_m (n,): where the hand would have the handle. max_damping_n_s_per_m: of passivity control, 0 for none. A handle
-    that is a metre away is not followed further: the rest is infinite.
+    that is a meter away is not followed further: the rest is infinite.
     """
     inwards = -np.array(model.contacts[0].normal)
     limits = Limits(1e6, 1e12, 1e6, 1e3, max_damping_n_s_per_m)

@@ -20,7 +20,7 @@ def compiled(function: Function) -> Function:
     """Compile `function`, every operation as written; Python calls it with the GIL held, so use it for microseconds.
 
     Nothing is compiled with `fastmath`: how sums are then reordered differs between two compilations of the same code, and a
-    replay would not be exact. And a test for NaN on such sums is optimised away.
+    replay would not be exact. And a test for NaN on such sums is optimized away.
     """
     return _compile(function, nogil=False)
 

@@ -1,6 +1,6 @@
 """A dot product for compiled code that is fast and always rounds the same: with vectors, but the sums in one stated order.
 
-A compiler that may reorder sums vectorises them too, but in an order of its own, which is another in another caller, after
+A compiler that may reorder sums vectorizes them too, but in an order of its own, which is another in another caller, after
 another start or on another processor. A replay that compares bit for bit can't live with that.
 """
 

@@ -69,11 +69,11 @@ def warnings_for(device: Device, model: ReducedModel, contact: int, scale: float
     warnings = stiffness_warnings(
         device.profile, stiffness, model.period_s, device.round_trip_s, device.damping_n_s_per_m
     )
-    passive_up_to_hz = model.evidence.passive_up_to_hz
+    passive_up_to_hz = model.accuracy.passive_up_to_hz
     if passive_up_to_hz < 0.5 / model.period_s * (1 - 1e-9):
         warnings.append(
             f"the model dissipates energy up to {passive_up_to_hz:.3g} Hz; faster than that it can give out "
-            f"{model.evidence.largest_energy_out_j * 1e3:.2g} mJ in a poke of 1 mm"
+            f"{model.accuracy.largest_energy_out_j * 1e3:.2g} mJ in a poke of 1 mm"
         )
     return warnings
 

@@ -92,7 +92,7 @@ class Service:
     def describe(self) -> dict[str, Any]:
         """The describe reply: what a client must know before it moves anything."""
         summary = self.model.summary()
-        summary["evidence"].pop("hankel_singular_values")
+        summary["accuracy"].pop("hankel_singular_values")
         return {
             "schema_version": wire.SCHEMA_VERSION,
             "session": self.keys.session,

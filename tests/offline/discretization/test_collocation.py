@@ -28,8 +28,8 @@ def _cube(n, jitter=0.0):
     return cloud, np.flatnonzero(cloud.points[:, 2] == 0)
 
 
-def _top_centre(cloud):
-    """The node or the four nodes nearest to the centre of the top face."""
+def _top_center(cloud):
+    """The node or the four nodes nearest to the center of the top face."""
     distance = np.linalg.norm(cloud.points - [0.5, 0.5, 1], axis=1)
     return np.flatnonzero(distance < distance.min() + 1e-9)
 
@@ -74,7 +74,7 @@ def test_the_patch_test_is_solved_exactly(cloud):
 
 def test_modes_satisfy_momentum_inside_and_zero_traction_on_the_free_surface():
     cloud, bottom = _cube(6, 0.1)
-    tip = _top_centre(cloud)
+    tip = _top_center(cloud)
     modes = collocation.elastic_modes(cloud, CUBE, bottom, [tip])
     divergence_of_stress, traction_rows = _rows(cloud)
     held = np.concatenate([bottom, tip])
@@ -96,7 +96,7 @@ def test_modes_satisfy_momentum_inside_and_zero_traction_on_the_free_surface():
 
 def test_the_static_force_is_the_traction_of_the_static_solution_times_its_area():
     cloud, bottom = _cube(6, 0.1)
-    tip = _top_centre(cloud)
+    tip = _top_center(cloud)
     modes = collocation.elastic_modes(cloud, CUBE, bottom, [tip])
     divergence_of_stress, traction_rows = _rows(cloud)
     # All rows at once, nothing eliminated.
@@ -115,7 +115,7 @@ def test_the_static_force_is_the_traction_of_the_static_solution_times_its_area(
 @pytest.mark.parametrize("tip", ["one node", "four nodes"])
 def test_all_poles_of_the_papers_cube_are_in_the_left_half_plane(tip):
     cloud, bottom = _cube(10)
-    contacts = {"one node": [_top_centre(cloud)[:1]], "four nodes": [_top_centre(cloud)]}[tip]
+    contacts = {"one node": [_top_center(cloud)[:1]], "four nodes": [_top_center(cloud)]}[tip]
     modes = collocation.elastic_modes(cloud, CUBE, bottom, contacts)
     judged = stability(modes, CUBE.prony)
     assert judged.growing_modes == 0
@@ -128,7 +128,7 @@ def test_all_poles_of_the_papers_cube_are_in_the_left_half_plane(tip):
 
 def test_complex_modes_come_in_conjugate_pairs_ascending_in_size():
     cloud, bottom = _cube(7, 0.2)
-    modes = collocation.elastic_modes(cloud, CUBE, bottom, [_top_centre(cloud)])
+    modes = collocation.elastic_modes(cloud, CUBE, bottom, [_top_center(cloud)])
     mu = modes.squared_frequencies
     assert np.all(np.diff(np.abs(mu)) >= 0)
     np.testing.assert_allclose(np.sort_complex(mu), np.sort_complex(mu.conj()), rtol=1e-9)

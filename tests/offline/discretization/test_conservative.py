@@ -1,4 +1,4 @@
-"""The conservative discretisation against exact fields, quadratic finite elements, Lamb's ball and its own energy."""
+"""The conservative discretization against exact fields, quadratic finite elements, Lamb's ball and its own energy."""
 
 import numpy as np
 import pytest
@@ -165,7 +165,7 @@ def test_a_free_ball_has_six_rigid_modes_and_lambs_frequencies_and_improves_with
     assert errors[1].max() < errors[0].max()
 
 
-def test_modes_are_mass_normalised_and_diagonalise_the_stiffness():
+def test_modes_are_mass_normalized_and_diagonalize_the_stiffness():
     cloud, bottom = _cube(5, 0.2)
     modes = conservative.elastic_modes(cloud, CUBE, bottom, [])
     k = conservative.stiffness(conservative.gradient(cloud), cloud.volumes, CUBE)

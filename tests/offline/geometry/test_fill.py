@@ -57,7 +57,7 @@ def test_boundary_nodes_lie_on_the_surface_and_the_others_well_inside(cloud):
 def test_nodes_keep_the_asked_distance(cloud):
     distance, _ = cKDTree(cloud.points).query(cloud.points, k=2)
     ratio = distance[:, 1] / cloud.spacing
-    # A hexagonal or body-centred lattice with one node per spacing^d has 1.07 and 1.09.
+    # A hexagonal or body-centered lattice with one node per spacing^d has 1.07 and 1.09.
     assert ratio.min() > 0.5
     assert ratio.max() < 1.4
     assert 0.85 < np.median(ratio) < 1.1
@@ -135,12 +135,12 @@ def test_a_patch_on_a_curved_surface_keeps_its_radii():
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     asked = Refinement((0.03, -0.04, 0.2), 0.025, 0.01, rings=True)
     cloud = fill_surface(from_trimesh(mesh), 0.025, [asked])
-    centre, _ = closest_point(np.array([asked.center_m]), cloud.surface.vertices, cloud.surface.triangles)
-    radius = np.linalg.norm(cloud.points[cloud.boundary] - centre, axis=1)
+    center, _ = closest_point(np.array([asked.center_m]), cloud.surface.vertices, cloud.surface.triangles)
+    radius = np.linalg.norm(cloud.points[cloud.boundary] - center, axis=1)
     for ring, expected in enumerate((1, 6, 12, 18)):
         assert np.sum(np.abs(radius - ring * 0.01) < 1e-8) == expected
     patch = contact_patch(asked.center_m, asked.radius_m, cloud)
-    np.testing.assert_allclose(patch.center_m, centre[0], rtol=1e-12)
+    np.testing.assert_allclose(patch.center_m, center[0], rtol=1e-12)
     assert len(patch.nodes) == 1 + 6 + 12
 
 

@@ -93,8 +93,8 @@ def test_a_region_that_makes_no_sense_is_refused(region, message):
         nodes_in(region, CUBE)
 
 
-def test_a_patch_between_nodes_is_centred_on_the_surface():
-    patch = contact_patch((0.5, 0.5, 1.3), 0.11, SEVENTHS)  # the four nodes around the top's centre
+def test_a_patch_between_nodes_is_centered_on_the_surface():
+    patch = contact_patch((0.5, 0.5, 1.3), 0.11, SEVENTHS)  # the four nodes around the top's center
     assert len(patch.nodes) == 4
     np.testing.assert_allclose(patch.center_m, (0.5, 0.5, 1), atol=1e-12)
     np.testing.assert_allclose(patch.normal, (0, 0, 1), atol=1e-12)

@@ -5,11 +5,11 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
-from palpate.lti.block_form import diagonalise, from_block_form, to_block_form
+from palpate.lti.block_form import diagonalize, from_block_form, to_block_form
 from palpate.lti.pole_residue import DiagonalSystem
 from palpate.model_file import StateSpace
-from palpate.reduction import discretise
-from palpate.reduction.evidence import step_through
+from palpate.reduction import discretize
+from palpate.reduction.accuracy import step_through
 
 
 def random_system(seed, n_real, n_pairs, n_inputs=3, n_outputs=3, speed=50.0):
@@ -54,7 +54,7 @@ def test_real_poles_with_imaginary_rows_become_real_blocks():
 
 
 @pytest.mark.parametrize(("n_real", "n_pairs"), SHAPES)
-def test_diagonalising_a_dense_system_keeps_its_transfer_function(n_real, n_pairs):
+def test_diagonalizing_a_dense_system_keeps_its_transfer_function(n_real, n_pairs):
     system = random_system(2, n_real, n_pairs)
     a, b, c, d = matrices(to_block_form(system))
     if n_real % 2:
@@ -64,7 +64,7 @@ def test_diagonalising_a_dense_system_keeps_its_transfer_function(n_real, n_pair
             np.delete(c, n_real, 1),
         )
     basis = np.linalg.qr(np.random.default_rng(3).standard_normal(a.shape))[0]
-    found = diagonalise(basis @ a @ basis.T, basis @ b, c @ basis.T, d)
+    found = diagonalize(basis @ a @ basis.T, basis @ b, c @ basis.T, d)
     assert found.n_states == len(a)
     s = np.array([0j, 7j, 400j, 1e4j])
     assert found.transfer(s) == pytest.approx(system.transfer(s), rel=1e-8, abs=1e-8)
@@ -73,7 +73,7 @@ def test_diagonalising_a_dense_system_keeps_its_transfer_function(n_real, n_pair
 def test_a_matrix_without_a_basis_of_eigenvectors_is_refused():
     jordan = np.array([[-1.0, 1.0], [0.0, -1.0]])
     with pytest.raises(ValueError, match="condition number"):
-        diagonalise(jordan, np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)))
+        diagonalize(jordan, np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)))
 
 
 @pytest.mark.parametrize(("n_real", "n_pairs"), SHAPES)
@@ -83,14 +83,14 @@ def test_the_discrete_model_follows_piecewise_linear_inputs_exactly(n_real, n_pa
     samples = np.random.default_rng(5).standard_normal((300, 3))
     samples[0] = 0
     _, expected, _ = scipy.signal.lsim(matrices(blocks), samples, np.arange(300) * period_s, interp=True)
-    found = step_through(discretise(blocks, period_s), samples)
+    found = step_through(discretize(blocks, period_s), samples)
     assert found == pytest.approx(expected, abs=1e-9 * np.max(np.abs(expected)))
 
 
 def test_the_discrete_model_agrees_with_scipys_first_order_hold():
     blocks = to_block_form(random_system(6, 3, 4))
     a, b, c, d, _ = scipy.signal.cont2discrete(matrices(blocks), 2e-3, method="foh")
-    found = discretise(blocks, 2e-3)
+    found = discretize(blocks, 2e-3)
     z = np.exp(1j * np.array([0.0, 0.01, 0.5, 3.0]))
     for point, value in zip(z, from_block_form(found).transfer(z), strict=True):
         assert value == pytest.approx(d + c @ np.linalg.solve(point * np.eye(len(a)) - a, b), rel=1e-8)
@@ -107,7 +107,7 @@ def test_poles_slower_than_round_off_keep_their_static_gain(slowness):
         np.ones((1, 1)),
     )
     a, b, c, d = matrices(blocks)
-    discrete = discretise(blocks, 1e-3)
+    discrete = discretize(blocks, 1e-3)
     da, db, _, dd = matrices(discrete)
     exact = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, 3))]]) * 1e-3)
     # B of the running form is B0 + A B1 of x+ = A x + B0 u + B1 u+, to first order in the slowness the sample's own hold
@@ -119,7 +119,7 @@ def test_poles_slower_than_round_off_keep_their_static_gain(slowness):
 def test_smooth_motions_lose_little_to_the_hold():
     """Force error of sampled sines at 1, 10 and 50 Hz and 1 kHz: the hold's own, about (omega T)²/12 a channel."""
     system = random_system(7, 4, 8, speed=30.0)
-    running = from_block_form(discretise(to_block_form(system), 1e-3))
+    running = from_block_form(discretize(to_block_form(system), 1e-3))
     for frequency, limit in ((1.0, 2e-5), (10.0, 1.5e-3), (50.0, 3e-2)):
         w = 2 * np.pi * frequency
         exact = system.transfer(np.array([1j * w]))[0]
@@ -129,7 +129,7 @@ def test_smooth_motions_lose_little_to_the_hold():
 
 def test_the_hold_has_a_zero_order_holds_pole_and_no_delay():
     blocks = to_block_form(random_system(8, 2, 2))
-    discrete = discretise(blocks, 1e-3)
+    discrete = discretize(blocks, 1e-3)
     assert np.sort_complex(np.linalg.eigvals(discrete.dense_a())) == pytest.approx(
         np.sort_complex(np.exp(1e-3 * np.linalg.eigvals(blocks.dense_a()))), rel=1e-10
     )
@@ -142,7 +142,7 @@ def test_the_hold_has_a_zero_order_holds_pole_and_no_delay():
 @pytest.mark.parametrize("period_s", [0.0, -1e-3, np.inf, np.nan])
 def test_a_period_out_of_range_is_named(period_s):
     with pytest.raises(ValueError, match="period_s"):
-        discretise(to_block_form(random_system(9, 2, 2)), period_s)
+        discretize(to_block_form(random_system(9, 2, 2)), period_s)
 
 
 def test_blocks_of_another_form_are_refused():

@@ -8,7 +8,7 @@ import scipy.signal
 
 from palpate.lti.block_form import from_block_form, to_block_form
 from palpate.lti.pole_residue import DiagonalSystem
-from palpate.lti.sampling import SamplingRule, discretise, sample, sampled_response
+from palpate.lti.sampling import SamplingRule, discretize, sample, sampled_response
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.modes.elastic_modes import ElasticModes
 from palpate.reduction.passivity import passivity_margin
@@ -33,7 +33,7 @@ def test_the_sampled_model_has_scipys_response(rule: SamplingRule) -> None:
     method = {"bilinear": "bilinear", "first-order-hold": "foh"}[rule]
     matrices = (blocks.dense_a(), blocks.b, blocks.c, blocks.d)
     a, b, c, d, _ = scipy.signal.cont2discrete(matrices, PERIOD_S, method=method)
-    found = from_block_form(discretise(blocks, PERIOD_S, rule))
+    found = from_block_form(discretize(blocks, PERIOD_S, rule))
     z = np.exp(1j * np.array([0.01, 0.3, 1.0, 3.0]))
     for point, value in zip(z, found.transfer(z), strict=True):
         expected = d + c @ np.linalg.solve(point * np.eye(len(a)) - a, b)

@@ -113,7 +113,7 @@ def test_a_hand_at_rest_feels_the_static_stiffness_and_at_an_instant_the_instant
     assert system.d == pytest.approx(1.8 * modes.direct_stiffness, rel=1e-12)
 
 
-def test_a_symmetric_body_has_a_symmetric_realisation_and_another_has_not():
+def test_a_symmetric_body_has_a_symmetric_realization_and_another_has_not():
     assert viscoelastic_system(modes_of(random_stiffness(4, 10, 3), 3), LIVER_LIKE).is_symmetric
     assert not viscoelastic_system(modes_of(random_stiffness(4, 10, 3, 0.3), 3), LIVER_LIKE).is_symmetric
 

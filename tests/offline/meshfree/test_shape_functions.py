@@ -114,14 +114,14 @@ def test_all_matrices_share_one_sparsity_pattern():
         assert np.shares_memory(matrix.indptr, h.value.indptr)
 
 
-def test_a_point_with_too_few_neighbours_is_refused_by_name():
+def test_a_point_with_too_few_neighbors_is_refused_by_name():
     nodes, radii = _nodes(3, "lattice")
     points = np.vstack([nodes[:3], [[3.0, 0.0, 0.0]]])
     with pytest.raises(SupportError, match=r"point 3 at \[3\., 0\., 0\.\] is covered by 0 nodes.*enlarge"):
         shape_functions(points, nodes, radii)
 
 
-def test_coplanar_neighbours_are_refused_by_name():
+def test_coplanar_neighbors_are_refused_by_name():
     nodes, radii = _nodes(2, "jittered")
     flat = np.column_stack([nodes, np.full(len(nodes), 0.25)])
     with pytest.raises(SupportError, match=r"point 0 .* nearly degenerate .*enlarge"):

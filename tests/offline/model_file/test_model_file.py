@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from palpate.model_file import (
+    AccuracyReport,
     Contact,
-    Evidence,
     ModelFileError,
     PoleResidueSystem,
     ReducedModel,
@@ -54,7 +54,7 @@ def small_model() -> ReducedModel:
             output=rng.normal(size=(3 * vertices, order)).astype(np.float32),
             feedthrough=rng.normal(size=(3 * vertices, channels)).astype(np.float32),
         ),
-        evidence=Evidence(
+        accuracy=AccuracyReport(
             error_in_band=0.01,
             error_in_band_continuous=0.009,
             error_static=0.001,
@@ -112,7 +112,7 @@ def test_a_model_that_can_not_be_written_leaves_the_old_file(tmp_path: Path) -> 
     path = tmp_path / "slab.npz"
     save_model(small_model(), path)
     bad = dataclasses.replace(
-        small_model(), evidence=dataclasses.replace(small_model().evidence, error_in_band=float("nan"))
+        small_model(), accuracy=dataclasses.replace(small_model().accuracy, error_in_band=float("nan"))
     )
     with pytest.raises(ValueError, match="JSON"):
         save_model(bad, path)
@@ -128,7 +128,7 @@ def test_the_same_model_gives_the_same_bytes(tmp_path: Path) -> None:
 
 def test_the_summary_is_plain_json_with_the_promised_keys() -> None:
     summary = json.loads(json.dumps(small_model().summary()))
-    assert {"order", "method", "n_nodes", "n_states_full", "period_s", "evidence"} <= summary.keys()
+    assert {"order", "method", "n_nodes", "n_states_full", "period_s", "accuracy"} <= summary.keys()
     assert {
         "error_in_band",
         "error_static",
@@ -139,8 +139,8 @@ def test_the_summary_is_plain_json_with_the_promised_keys() -> None:
         "passivity_margin",
         "resolved_frequency_hz",
         "hankel_singular_values",
-    } <= summary["evidence"].keys()
-    assert summary["evidence"]["error_bound"] is None
+    } <= summary["accuracy"].keys()
+    assert summary["accuracy"]["error_bound"] is None
     assert summary["order"] == 6
 
 
@@ -256,11 +256,11 @@ def set_array(key: str, value: Any) -> Callable[[dict[str, Any], dict[str, Any]]
         (set_meta("period_s", "soon"), "metadata can't be read"),
         (set_meta("period_s", 1e-9), "'period_s' is 1e-09: expected from 0.0001 to 0.1"),
         (set_meta("period_s", float("nan")), "metadata holds NaN"),
-        (lambda m, a: m["evidence"].update(error_in_band="x"), "'evidence.error_in_band' is 'x': expected a number"),
+        (lambda m, a: m["accuracy"].update(error_in_band="x"), "'accuracy.error_in_band' is 'x': expected a number"),
         (lambda m, a: m["contacts"][0].update(normal=[0, 0, 2]), "normal of length 2 at 'tip'"),
         (lambda m, a: m["contacts"].append(m["contacts"][0]), "'continuous_b' is float64"),
         (lambda m, a: m.pop("method"), "'method' is missing"),
-        (lambda m, a: m["evidence"].pop("error_in_band"), "'evidence.error_in_band' is missing"),
+        (lambda m, a: m["accuracy"].pop("error_in_band"), "'accuracy.error_in_band' is missing"),
         (lambda m, a: a.pop("discrete_b"), "'discrete_b' is missing"),
         (set_array("discrete_b", np.zeros((6, 2))), r"'discrete_b' is float64 \(6, 2\): expected float64 \(6, 3\)"),
         (set_array("discrete_c", np.zeros((3, 6), np.float32)), r"'discrete_c' is float32"),

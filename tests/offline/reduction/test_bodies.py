@@ -8,20 +8,20 @@ import pytest
 from palpate.build import build_model
 from palpate.discretization import collocation, conservative
 from palpate.geometry.shapes import box_lattice
-from palpate.lti.block_form import diagonalise
+from palpate.lti.block_form import diagonalize
 from palpate.lti.frequencies import band_frequencies
 from palpate.lti.pole_residue import DiagonalSystem, full_system
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.reduction import hankel_optimal, reduce
+from palpate.reduction.accuracy import hinf_error, in_band_error
 from palpate.reduction.balancing import balance
-from palpate.reduction.evidence import hinf_error, in_band_error
 from palpate.reduction.gramians import gramians, real_form
 from palpate.scene.material import PRESETS
 from palpate.scene.schema import check_config, load_config
 
 
 def cube(n, discretization):
-    """The paper's section 4.2: bottom fixed, a tip of the nodes around the top centre."""
+    """The paper's section 4.2: bottom fixed, a tip of the nodes around the top center."""
     cloud = box_lattice((0, 0, 0), (1, 1, 1), (n, n, n))
     material = PRESETS["paper-cube"]
     bottom = np.flatnonzero(cloud.points[:, 2] < 1e-9)
@@ -59,7 +59,7 @@ def test_hankel_optimal_reduction_of_eight_thousand_states_reaches_the_next_sing
     _, full = cube(10, conservative)
     reduced = hankel_optimal(full, 100)
     plain = reduced.system
-    other = diagonalise(plain.a, plain.b, plain.c, plain.d)
+    other = diagonalize(plain.a, plain.b, plain.c, plain.d)
     difference = DiagonalSystem(
         np.concatenate([full.poles, other.poles]),
         np.concatenate([full.b, other.b]),
@@ -106,9 +106,9 @@ def liver(**changes):
 
 def test_a_coarse_liver_is_within_two_percent_at_order_120():
     config, folder = liver(geometry__spacing_m=0.02, contact__radius_m=0.012, contact__spacing_m=0.008)
-    evidence = build_model(config, folder, Silent()).evidence
-    assert evidence.error_in_band < 0.02
-    assert evidence.error_static < 0.02
+    accuracy = build_model(config, folder, Silent()).accuracy
+    assert accuracy.error_in_band < 0.02
+    assert accuracy.error_static < 0.02
 
 
 @pytest.mark.slow
@@ -119,10 +119,10 @@ def test_the_shipped_liver_is_within_two_percent_at_order_120_and_plain_balancin
     model = build_model(config, folder, Silent())
     assert model.n_nodes >= 1000
     assert model.contacts[0].n_nodes >= 19
-    assert model.evidence.error_in_band < 0.02
-    assert model.evidence.error_static < 0.02
-    assert model.evidence.error_surface_in_band < 0.25
-    assert model.evidence.passive_up_to_hz > 10 * config.reduction.band_hz[1]
+    assert model.accuracy.error_in_band < 0.02
+    assert model.accuracy.error_static < 0.02
+    assert model.accuracy.error_surface_in_band < 0.25
+    assert model.accuracy.passive_up_to_hz > 10 * config.reduction.band_hz[1]
     full = full_system(model.full)
     plain = reduce(full, "tbr", order=120)
     assert static_error(full, plain.system) > 1  # why band-limited balancing is the default for organs

@@ -101,7 +101,7 @@ def test_hankel_singular_values_agree_with_slicot_and_pymor(name):
     a, b, c, _ = matrices(system)  # SLICOT overwrites its arguments
     by_pymor = LTIModel.from_matrices(system.a, system.b, system.c, system.d).hsv()
     by_slicot = ctrlsys.ab09ad("C", "B", "S", "F", len(a), b.shape[1], len(c), 3, a, b, c, 0.0)[3]
-    # pyMOR's dense route factorises rounded Gramians, which costs half of the digits.
+    # pyMOR's dense route factorizes rounded Gramians, which costs half of the digits.
     for other, least in ((by_slicot, 1e-10), (by_pymor, 1e-4)):
         kept = other > least * other[0]
         assert found[: len(kept)][kept[: len(found)]] == pytest.approx(other[kept], rel=1e-6)

@@ -12,7 +12,7 @@ from palpate.lti.pole_residue import DiagonalSystem
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.modes.elastic_modes import ElasticModes
 from palpate.reduction import METHODS, ReductionError, reduce
-from palpate.reduction.evidence import hinf_error, in_band_error
+from palpate.reduction.accuracy import hinf_error, in_band_error
 from palpate.reduction.gramians import (
     band_controllability_factor,
     band_quadrature,

@@ -77,7 +77,7 @@ def test_a_handle_on_a_delayed_spring_moves_as_the_sampled_loop_does(
         expected.append(state[:2] + np.array([rest, 0.0]))
         state = matrix @ state
     assert np.ptp(np.array(expected)[:, 0]) > 1e-6
-    # Rounding: some 1e-16 of some millimetres and of their velocities a tick, not amplified by a stable loop.
+    # Rounding: some 1e-16 of some millimeters and of their velocities a tick, not amplified by a stable loop.
     np.testing.assert_allclose(motion[begin : begin + 500], expected, rtol=0, atol=1e-11)
 
 

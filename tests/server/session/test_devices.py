@@ -60,8 +60,8 @@ def test_a_model_that_can_give_out_energy_is_warned_about(
     model = make_spring_mass_model()
     device = Device(replace(GENERIC, max_stiffness_n_per_m=1e9))
     assert warnings_for(device, model, 0, 1.0) == []
-    evidence = replace(model.evidence, passive_up_to_hz=425.0, largest_energy_out_j=1.6e-4)
-    (warning,) = warnings_for(device, replace(model, evidence=evidence), 0, 1.0)
+    accuracy = replace(model.accuracy, passive_up_to_hz=425.0, largest_energy_out_j=1.6e-4)
+    (warning,) = warnings_for(device, replace(model, accuracy=accuracy), 0, 1.0)
     assert "425 Hz" in warning
     assert "0.16 mJ" in warning
 
@@ -69,7 +69,7 @@ def test_a_model_that_can_give_out_energy_is_warned_about(
 def test_the_sample_model_is_passive_at_every_frequency(
     make_spring_mass_model: Callable[..., ReducedModel],
 ) -> None:
-    """As its evidence says. By the dense response: no sinusoid gets energy out."""
+    """As its accuracy report says. By the dense response: no sinusoid gets energy out."""
     model = make_spring_mass_model(2, 20)
     system, a = model.discrete, model.discrete.dense_a()
     for theta in np.linspace(0, np.pi, 300):

@@ -1,4 +1,4 @@
-"""The evidence measured in other ways: Hamiltonian eigenvalues, simulated pokes, held-out surface frequencies."""
+"""The accuracy report measured in other ways: Hamiltonian eigenvalues, simulated pokes, held-out surface frequencies."""
 
 import itertools
 
@@ -10,8 +10,8 @@ from palpate.lti.frequencies import maximum
 from palpate.lti.pole_residue import DiagonalSystem
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.modes.elastic_modes import ElasticModes
-from palpate.reduction import METHODS, discretise, fit_surface_output, measure, reduce
-from palpate.reduction.evidence import hinf_error, poke, step_through, time_domain_error
+from palpate.reduction import METHODS, discretize, fit_surface_output, measure, reduce
+from palpate.reduction.accuracy import hinf_error, poke, step_through, time_domain_error
 from palpate.reduction.gramians import real_form
 from palpate.reduction.passivity import largest_energy_out, passive_up_to, passivity_margin, worst_poke
 from palpate.scene.material import PronySeries
@@ -60,7 +60,7 @@ def evidence_of(full, method, order):
     return reduction, measure(
         full,
         reduction,
-        discretise(reduction.state_space, PERIOD_S),
+        discretize(reduction.state_space, PERIOD_S),
         period_s=PERIOD_S,
         band_hz=(0.0, 30.0),
         error_surface_in_band=0.25,
@@ -70,28 +70,28 @@ def evidence_of(full, method, order):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_every_figure_of_the_evidence_agrees_with_plain_sampling(full, method):
-    reduction, evidence = evidence_of(full, method, 60)
+    reduction, accuracy = evidence_of(full, method, 60)
     reduced = reduction.system
     error = lambda w: np.linalg.norm(full.transfer(1j * w) - reduced.transfer(1j * w), 2, axis=(1, 2))  # noqa: E731
     gain = lambda w: np.linalg.norm(full.transfer(1j * w), 2, axis=(1, 2))  # noqa: E731
     band = 2 * np.pi * np.linspace(0, 30, 3001)
     everywhere = np.concatenate([[0.0], np.geomspace(1e-2, 1e6, 6000)])
-    assert evidence.error_in_band_continuous == pytest.approx(np.max(error(band) / gain(band)), rel=0.02)
-    assert evidence.error_in_band_continuous >= np.max(error(band) / gain(band)) * (1 - 1e-9)
-    running = from_block_form(discretise(reduction.state_space, PERIOD_S))
+    assert accuracy.error_in_band_continuous == pytest.approx(np.max(error(band) / gain(band)), rel=0.02)
+    assert accuracy.error_in_band_continuous >= np.max(error(band) / gain(band)) * (1 - 1e-9)
+    running = from_block_form(discretize(reduction.state_space, PERIOD_S))
     sampled = np.linalg.norm(
         full.transfer(1j * band) - running.transfer(np.exp(1j * band * PERIOD_S)), 2, (1, 2)
     )
-    assert evidence.error_in_band == pytest.approx(np.max(sampled / gain(band)), rel=0.02)
-    assert evidence.error_static == pytest.approx((error(np.zeros(1)) / gain(np.zeros(1)))[0], abs=1e-12)
-    assert evidence.error_hinf >= np.max(error(everywhere)) / np.max(gain(everywhere)) * (1 - 1e-3)
-    assert evidence.spectral_abscissa == np.max(reduced.poles.real)
-    assert evidence.spectral_abscissa_full == full.spectral_abscissa
-    assert (evidence.error_surface_in_band, evidence.resolved_frequency_hz) == (0.25, 12.0)
+    assert accuracy.error_in_band == pytest.approx(np.max(sampled / gain(band)), rel=0.02)
+    assert accuracy.error_static == pytest.approx((error(np.zeros(1)) / gain(np.zeros(1)))[0], abs=1e-12)
+    assert accuracy.error_hinf >= np.max(error(everywhere)) / np.max(gain(everywhere)) * (1 - 1e-3)
+    assert accuracy.spectral_abscissa == np.max(reduced.poles.real)
+    assert accuracy.spectral_abscissa_full == full.spectral_abscissa
+    assert (accuracy.error_surface_in_band, accuracy.resolved_frequency_hz) == (0.25, 12.0)
     if method == "tbr":
-        assert evidence.error_hinf <= evidence.error_bound
+        assert accuracy.error_hinf <= accuracy.error_bound
     else:
-        assert evidence.error_bound is None
+        assert accuracy.error_bound is None
 
 
 def test_the_hinf_error_is_where_the_hamiltonian_touches_the_imaginary_axis(full):
@@ -130,8 +130,8 @@ def test_the_time_domain_error_is_that_of_stepping_both_models(full):
     assert np.max(np.abs(inputs)) == pytest.approx(1.05e-3, rel=0.01)
     assert np.all(inputs[0] == 0)
     assert np.all(inputs[-1] == 0)
-    exact = step_through(discretise(to_block_form(full), PERIOD_S), inputs)
-    running = discretise(reduction.state_space, PERIOD_S)
+    exact = step_through(discretize(to_block_form(full), PERIOD_S), inputs)
+    running = discretize(reduction.state_space, PERIOD_S)
     expected = np.max(np.linalg.norm(step_through(running, inputs) - exact, axis=1))
     expected /= np.max(np.linalg.norm(exact, axis=1))
     assert time_domain_error(full, running, inputs, PERIOD_S) == pytest.approx(expected, rel=1e-3, abs=1e-12)
@@ -149,7 +149,7 @@ def worked_out(discrete_state_space, theta, amplitudes, n_cycles=400):
 
 @pytest.mark.parametrize("per_cycle", [7, 40, 200])
 def test_the_work_of_a_closed_poke_is_what_the_formula_says(full, per_cycle):
-    running = discretise(reduce(full, "tbr", order=20).state_space, PERIOD_S)
+    running = discretize(reduce(full, "tbr", order=20).state_space, PERIOD_S)
     theta = 2 * np.pi / per_cycle
     a = np.array([1.0, 0.3 - 0.8j, -0.2j]) * 1e-3
     g = from_block_form(running).transfer(np.array([np.exp(1j * theta)]))[0]
@@ -164,7 +164,7 @@ def test_a_model_that_is_not_passive_gives_out_the_stated_energy_and_no_more():
     active = DiagonalSystem(
         poles, b, (b * np.array([[400.0], [300.0]])).T.copy(), 10 * np.eye(2), np.arange(2)
     )
-    running = discretise(to_block_form(active), PERIOD_S)
+    running = discretize(to_block_form(active), PERIOD_S)
     system = from_block_form(running)
     assert passivity_margin(system) < 0
     most = largest_energy_out(system, 1e-3)
@@ -189,14 +189,14 @@ def test_a_circular_poke_on_a_nonsymmetric_stiffness_gets_energy_out():
 
 def test_the_full_symmetric_body_dissipates(full):
     # Positive everywhere, but the sampled-data hold and round-off leave their own small amounts.
-    assert passivity_margin(from_block_form(discretise(to_block_form(full), PERIOD_S))) > -1e-9
+    assert passivity_margin(from_block_form(discretize(to_block_form(full), PERIOD_S))) > -1e-9
 
 
 @pytest.mark.parametrize(("method", "order"), [("tbr-band", 50), ("modal-static", 200)])
 def test_surface_displacements_follow_the_full_model_between_the_fitted_frequencies(
     modes, full, method, order
 ):
-    running = discretise(reduce(full, method, order=order).state_space, PERIOD_S)
+    running = discretize(reduce(full, method, order=order).state_space, PERIOD_S)
     rows = np.arange(60)
     surface = fit_surface_output(
         modes,
@@ -222,7 +222,7 @@ def test_surface_displacements_follow_the_full_model_between_the_fitted_frequenc
 
 
 def test_surface_shapes_that_do_not_match_the_modes_are_named(modes, full):
-    running = discretise(reduce(full, "tbr-band", order=20).state_space, PERIOD_S)
+    running = discretize(reduce(full, "tbr-band", order=20).state_space, PERIOD_S)
     with pytest.raises(ValueError, match="surface_shapes"):
         fit_surface_output(
             modes,
@@ -243,10 +243,10 @@ def test_a_system_that_turns_active_says_from_which_frequency_on(full):
         np.array([[500.0]]),
         np.arange(2),
     )
-    running = from_block_form(discretise(to_block_form(pair), PERIOD_S))
+    running = from_block_form(discretize(to_block_form(pair), PERIOD_S))
     theta = np.linspace(1e-4, np.pi, 200001)
     imaginary = running.transfer(np.exp(1j * theta))[:, 0, 0].imag
     first = theta[np.argmax(imaginary < -1e-3 * abs(running.transfer(np.ones(1, dtype=complex))[0, 0, 0]))]
     assert 0 < first < np.pi
     assert passive_up_to(running) == pytest.approx(first, abs=1e-4)
-    assert passive_up_to(from_block_form(discretise(to_block_form(full), PERIOD_S))) == np.pi
+    assert passive_up_to(from_block_form(discretize(to_block_form(full), PERIOD_S))) == np.pi

@@ -1,4 +1,4 @@
-"""Figure 2: the deflection of the disc's centre, PCMFS against finite elements and the exact series."""
+"""Figure 2: the deflection of the disc's center, PCMFS against finite elements and the exact series."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from palpate.scene.material import PronySeries
 from palpate_paper import finite_element_fields, membrane, spot_load
 from palpate_paper.convergence import DISC_SPOT
-from palpate_paper.examples import centre_of
+from palpate_paper.examples import center_of
 from palpate_paper.figure import Figure, tidy
 from palpate_paper.membranes import disc_membrane
 from palpate_paper.study import Study
@@ -20,7 +20,7 @@ _DURATION_S = 3.0
 _NODES, _ELEMENT_NODES = 500, 88  # 88 nodes in rings make 145 triangles, as the paper's
 
 
-def centre_displacement(study: Study) -> Figure:
+def center_displacement(study: Study) -> Figure:
     """The paper's history as a force on a smooth spot, 3 s."""
     cloud = disc_membrane(150 if study.quick else _NODES)
     mesh = disc_membrane(_ELEMENT_NODES)
@@ -31,7 +31,7 @@ def centre_displacement(study: Study) -> Figure:
     pressure = spot_load.spot(np.linalg.norm(cloud.points, axis=1), DISC_SPOT)
     curves = {
         "exact": _at(0, *spot_load.disc_modes(origin, DISC_SPOT), len(times)),
-        f"linear finite elements, {triangles} triangles": _at(centre_of(mesh)[0], *elements, len(times)),
+        f"linear finite elements, {triangles} triangles": _at(center_of(mesh)[0], *elements, len(times)),
     }
     for name, modes in (
         ("PCMFS conservative", membrane.conservative_modes(cloud)),
@@ -39,7 +39,7 @@ def centre_displacement(study: Study) -> Figure:
         ("PCMFS collocation, quadratic", membrane.collocation_modes(cloud, order=2)),
     ):
         load = spot_load.modal_load(modes.shapes, pressure)
-        curve = _at(centre_of(cloud)[0], modes.squared_frequencies, modes.shapes, load, len(times))
+        curve = _at(center_of(cloud)[0], modes.squared_frequencies, modes.shapes, load, len(times))
         curves[f"{name}, {cloud.n_nodes} nodes"] = curve
     exact = curves["exact"]
     errors = {name: float(np.linalg.norm(c - exact) / np.linalg.norm(exact)) for name, c in curves.items()}
@@ -56,18 +56,18 @@ def centre_displacement(study: Study) -> Figure:
         for (name, curve), style in zip(curves.items(), styles, strict=True):
             axis.plot(times, 1e3 * curve, label=name, **({"linewidth": 1.1} | style))
         axis.axvspan(0, spot_load.LOAD_ENDS_S, color="0.92")
-        axis.set(xlabel="time, s (load until 0.2 s)", ylabel="deflection of the centre, mm")
+        axis.set(xlabel="time, s (load until 0.2 s)", ylabel="deflection of the center, mm")
         axis.legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
         tidy(axis)
 
     listed = "; ".join(f"{name}: {100 * e:.2g} %" for name, e in errors.items() if name != "exact")
     return Figure(
         2,
-        "Disc: deflection of the centre",
+        "Disc: deflection of the center",
         ("time_s", *(f"{name.replace(', ', '_').replace(' ', '_')}_m" for name in curves)),
         np.column_stack([times, *curves.values()]).tolist(),
         draw,
-        "The paper prescribes the displacement of the centre and plots the displacement of the centre, which would be the "
+        "The paper prescribes the displacement of the center and plots the displacement of the center, which would be the "
         "input itself; we read u(t) as a force, on a smooth spot of half the radius, for which there is an exact series. "
         f"Difference from it over 3 s, root mean square relative to the curve's: {listed}. Linear consistency is order 0 for "
         "the second derivatives that collocation takes, so that its waves travel at a wrong speed; the quadratic "

@@ -1,4 +1,4 @@
-"""Figure 15: the paper's collocation beside the conservative discretisation, full and reduced."""
+"""Figure 15: the paper's collocation beside the conservative discretization, full and reduced."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from palpate.lti.pole_residue import DiagonalSystem
-from palpate.reduction.evidence import hinf_error
+from palpate.reduction.accuracy import hinf_error
 from palpate_paper.examples import Example, cube, disc, square
 from palpate_paper.figure import Cell, Figure, tidy
 from palpate_paper.frequency_responses import frequencies_hz
@@ -17,8 +17,8 @@ from palpate_paper.orders import ORDERS
 from palpate_paper.study import Study
 
 
-def both_discretisations(study: Study) -> Figure:
-    """Figure 15: the paper's collocation beside the conservative discretisation, full and reduced, square and cube."""
+def both_discretizations(study: Study) -> Figure:
+    """Figure 15: the paper's collocation beside the conservative discretization, full and reduced, square and cube."""
     study.note("square and cube by collocation")
     pairs = [
         (study.square, square(9 if study.quick else 15, "collocation")),
@@ -30,14 +30,14 @@ def both_discretisations(study: Study) -> Figure:
         axes = canvas.subplots(2, 2)
         for column, ((ours, theirs), (hz, responses, errors)) in enumerate(zip(pairs, curves, strict=True)):
             top, bottom = axes[:, column]
-            for example, response, colour in zip(
+            for example, response, color in zip(
                 (ours, theirs), responses, ("tab:blue", "tab:red"), strict=True
             ):
                 name = "conservative" if example is ours else "collocation"
                 top.loglog(
                     hz,
                     response,
-                    color=colour,
+                    color=color,
                     linewidth=1,
                     label=f"{name}, {example.system.n_states:,} states",
                 )
@@ -48,7 +48,7 @@ def both_discretisations(study: Study) -> Figure:
                 bottom.semilogy(
                     [o for o, _ in series],
                     [max(e, 1e-10) for _, e in series],
-                    color=method.colour,
+                    color=method.color,
                     marker=method.marker,
                     markersize=4,
                     linewidth=1,
@@ -69,12 +69,12 @@ def both_discretisations(study: Study) -> Figure:
     lines.append(f"- disc by collocation, with its drag: {_state(disc_by_collocation(study).system)}.")
     lines.append(
         "\nCollocation is not symmetric: its squared frequencies are complex, and only damping keeps its modes from growing. "
-        "What is stable reduces as well as the conservative discretisation does (solid and dashed curves)."
+        "What is stable reduces as well as the conservative discretization does (solid and dashed curves)."
     )
     return Figure(
         15,
-        "The paper's collocation beside the conservative discretisation",
-        ("example", "discretisation", "method", "states", "error_hinf"),
+        "The paper's collocation beside the conservative discretization",
+        ("example", "discretization", "method", "states", "error_hinf"),
         rows,
         draw,
         "\n".join(lines),

@@ -14,7 +14,7 @@ from palpate.lti.frequencies import (
     spectral_norms,
 )
 from palpate.lti.pole_residue import DiagonalSystem
-from palpate.model_file import Evidence, StateSpace
+from palpate.model_file import AccuracyReport, StateSpace
 from palpate.reduction.methods import Reduction
 from palpate.reduction.passivity import largest_energy_out, passive_up_to, passivity_margin
 
@@ -32,10 +32,10 @@ def measure(
     band_hz: tuple[float, float],
     error_surface_in_band: float,
     resolved_frequency_hz: float,
-) -> Evidence:
-    """All the evidence that goes with a model; `palpate.model_file.Evidence` defines each figure.
+) -> AccuracyReport:
+    """The accuracy report that goes with a model; `palpate.model_file.AccuracyReport` defines each figure.
 
-    discrete  the reduction's state space discretised at period_s
+    discrete  the reduction's state space discretized at period_s
     The surface error and the resolved frequency are passed on.
     """
     running = from_block_form(discrete)
@@ -47,7 +47,7 @@ def measure(
     def error_once_sampled(omega: Array) -> Array:
         return relative_errors(full.transfer(1j * omega), running.transfer(np.exp(1j * omega * period_s)))
 
-    return Evidence(
+    return AccuracyReport(
         error_in_band=maximum(error_once_sampled, in_band)[1],
         error_in_band_continuous=in_band_error(full, reduction.system, in_band),
         error_static=float(relative_errors(full.transfer(zero), reduction.system.transfer(zero))[0]),
