@@ -1,1 +1,50 @@
-"""A client's side of palpate: facts of the wire, connection, tools and decoders. Needs eclipse-zenoh and msgpack alone."""
+"""A client's side of palpate: connection, tools and decoders. Needs eclipse-zenoh and msgpack alone.
+
+with Connection() as connection, Tool(connection) as tool:
+    tool.move(tool.at_depth(0.003))
+    print(tool.take_force())
+"""
+
+from palpate_client.connection import Connection, steps
+from palpate_client.contract import Contract
+from palpate_client.errors import (
+    ClientError,
+    ConfigurationError,
+    Incompatible,
+    Refused,
+    ServerGone,
+    ToolLost,
+)
+from palpate_client.messages import (
+    Description,
+    Force,
+    Frame,
+    Geometry,
+    Surface,
+    ToolDescription,
+    decode_geometry,
+    decode_surface,
+)
+from palpate_client.tool import OneSidedContact, Tool
+
+__all__ = [
+    "ClientError",
+    "ConfigurationError",
+    "Connection",
+    "Contract",
+    "Description",
+    "Force",
+    "Frame",
+    "Geometry",
+    "Incompatible",
+    "OneSidedContact",
+    "Refused",
+    "ServerGone",
+    "Surface",
+    "Tool",
+    "ToolDescription",
+    "ToolLost",
+    "decode_geometry",
+    "decode_surface",
+    "steps",
+]

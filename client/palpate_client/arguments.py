@@ -1,0 +1,57 @@
+"""What the programs that connect to a server have in common on their command lines."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+from palpate_client import wire
+from palpate_client.connection import Connection
+
+
+def add_connection_options(parser: argparse.ArgumentParser, *, name: bool = True) -> None:
+    parser.add_argument(
+        "--connect",
+        default=wire.DEFAULT_ENDPOINT,
+        metavar="ENDPOINT",
+        help="where the server listens (%(default)s)",
+    )
+    parser.add_argument(
+        "--session",
+        type=plain_name,
+        default=wire.DEFAULT_SESSION,
+        help="the server's --session (%(default)s)",
+    )
+    parser.add_argument(
+        "--zenoh-config", metavar="FILE", help="Zenoh configuration to use instead of --connect"
+    )
+    if name:
+        parser.add_argument(
+            "--name",
+            type=plain_name,
+            help="this client's; under access control, that in its certificate (default: a random one)",
+        )
+
+
+def connection_for(options: argparse.Namespace) -> Connection:
+    """The connection that these options ask for, to be entered."""
+    name = getattr(options, "name", None)
+    return Connection(options.connect, options.session, zenoh_config=options.zenoh_config, name=name)
+
+
+def plain_name(text: str) -> str:
+    """A name that becomes a part of keys. Raises argparse.ArgumentTypeError."""
+    if not wire.is_name(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not 1 to 64 of A-Z a-z 0-9 _ -")
+    return text
+
+
+def positive(text: str) -> float:
+    """A finite number above 0. Raises argparse.ArgumentTypeError."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value

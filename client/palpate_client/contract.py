@@ -1,0 +1,180 @@
+"""What a client may rely on, checked message by message, and the round-trip times that follow from it."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from typing import Any
+
+from palpate_client.messages import Description, Force
+from palpate_client.wire import Flags
+
+ROUNDING_N = 1e-9
+REMEMBERED = 10_000  # commands: an answer to an older one breaks the contract anyway
+# A busy machine or network may delay commands until the force has faded. The flags tell, and nobody has promised to prevent
+# it. Zenoh closes a link on which nothing moves for this long, so a longer silence has another cause.
+UNHEARD_NS = 1_000_000_000
+MOST_BREAKS_TOLD = 20  # one cause can break every tick; the first ones tell
+
+
+class Contract:
+    """Checks the forces of one tool against what the server promises, and against the commands that were sent."""
+
+    def __init__(self, description: Description) -> None:
+        self.holding = False  # the tool, as far as we know
+        self.broken: list[str] = []
+        self.forces_received = 0
+        self.forces_lost = 0
+        self.commands_sent = 0
+        self.commands_answered = 0
+        self.largest_force_n = 0.0
+        self._max_force_n = description.max_force_n
+        self._max_step_n = description.max_force_rate_n_per_s * description.period_s
+        self._hold_ns = (description.hold_s + description.period_s) * 1e9
+        self._fade_ns = (description.hold_s + description.decay_s) * 1e9
+        self._sent: dict[int, int] = {}  # sequence -> client_time_ns, the newest REMEMBERED ones
+        self._newest_answered = -1
+        self._round_trips_ns = array("q")  # an hour at 1 kHz is 29 MB
+        self._flag_counts = dict.fromkeys(Flags, 0)
+        self._breaks = 0
+        self._last: Force | None = None
+        self._newest_sent_ns = 0
+        self._sending_since_ns = 0  # without a pause in which our force would fade
+        self._unheard = False
+
+    def acquired(self, max_force_n: float) -> None:
+        """`acquire` was granted: from now on the tool is ours, with this limit of the force."""
+        self._max_force_n = max_force_n
+        self._newest_answered = -1
+        self.holding = True
+
+    def released(self) -> None:
+        """Call it before the tool is released or acquired again: the server then forgets our commands rightly."""
+        self.holding = False
+
+    def on_sent(self, sequence: int, client_time_ns: int) -> None:
+        """Call it before the command is sent: the answer may come before `put` returns."""
+        if client_time_ns - self._newest_sent_ns > self._fade_ns:
+            self._sending_since_ns = client_time_ns
+        self._newest_sent_ns = client_time_ns
+        self._sent[sequence] = client_time_ns
+        self.commands_sent += 1
+        self._sent.pop(sequence - REMEMBERED, None)
+
+    def on_force(self, force: Force) -> bool:
+        """True when nothing about this force breaks the contract: only then may it be rendered, and only while holding."""
+        breaks = self._breaks
+        self.forces_received += 1
+        for flag in Flags:
+            if force.flags & flag:
+                self._flag_counts[flag] += 1
+        if self._check_value(force) and self._check_order(force):
+            self._check_answer(force)
+        return self._breaks == breaks
+
+    def measure_anew(self) -> None:
+        """Round trips that were measured until now do not count."""
+        self._round_trips_ns = array("q")
+
+    def round_trip_s(self, share: float) -> float | None:
+        """Time below which this share of the round trips lies, s; None without one."""
+        ordered = sorted(self._round_trips_ns)
+        return ordered[min(len(ordered) - 1, int(share * len(ordered)))] * 1e-9 if ordered else None
+
+    def summary(self) -> dict[str, Any]:
+        shares = {"p50": 0.5, "p99": 0.99, "p99_9": 0.999, "max": 1.0}
+        return {
+            "commands_sent": self.commands_sent,
+            "commands_answered": self.commands_answered,
+            "commands_unanswered": self.commands_sent - self.commands_answered,
+            "forces_received": self.forces_received,
+            "forces_lost": self.forces_lost,
+            "round_trip_s": {name: self.round_trip_s(share) for name, share in shares.items()},
+            "largest_force_n": self.largest_force_n,
+            "flags": {flag.name: count for flag, count in self._flag_counts.items() if count},
+            "contract_broken": self.broken,
+        }
+
+    def _check_value(self, force: Force) -> bool:
+        """False when nothing more can be said of this force."""
+        if not all(math.isfinite(f) for f in force.force_n):
+            self._break(force, f"the force {list(force.force_n)} is not finite")
+            return False
+        magnitude = math.hypot(*force.force_n)
+        self.largest_force_n = max(self.largest_force_n, magnitude)
+        if magnitude > self._max_force_n + ROUNDING_N:
+            self._break(force, f"the force is {magnitude} N, the limit {self._max_force_n} N")
+        if force.flags & Flags.STALE and magnitude > 0:
+            self._break(force, f"the input is stale and the force still {magnitude} N")
+        if not force.flags & (Flags.DECAYING | Flags.STALE) and force.input_age_ns > self._hold_ns:
+            self._break(force, f"the input is {force.input_age_ns / 1e6} ms old and no flag says so")
+        if self.holding and force.sequence < 0 <= self._newest_answered:
+            # The server keeps a holder's last command, however silent the holder is.
+            self._lose(
+                force,
+                "we no longer hold the tool, our commands are forgotten: it was released or taken back "
+                "(after a second of silence, for instance), or the server has stopped or was started again",
+            )
+            return False
+        return True
+
+    def _check_order(self, force: Force) -> bool:
+        """False for a force that came too late."""
+        last = self._last
+        if last is not None:
+            if force.tick <= last.tick:
+                self._break(force, f"it came after tick {last.tick}")
+                return False
+            self.forces_lost += force.tick - last.tick - 1
+            step = math.dist(force.force_n, last.force_n)
+            if force.tick == last.tick + 1 and step > self._max_step_n + ROUNDING_N:
+                self._break(force, f"the force jumped by {step} N in one tick")
+            if self.holding and 0 <= force.sequence < last.sequence:
+                self._break(
+                    force, f"it answers command {force.sequence}, the tick before answered {last.sequence}"
+                )
+        self._last = force
+        return True
+
+    def _check_answer(self, force: Force) -> None:
+        sent_ns = self._sent.get(force.sequence)
+        if sent_ns is not None and sent_ns == force.client_time_ns:
+            if force.sequence > self._newest_answered:
+                self._newest_answered = force.sequence
+                self.commands_answered += 1
+                self._round_trips_ns.append(force.arrival_ns - sent_ns)
+            if self.holding:
+                self._check_heard(force, sent_ns)
+        elif self.holding and force.sequence >= 0:  # without the tool, the answers are to other clients
+            self._lose(
+                force,
+                f"we no longer hold the tool: it answers command {force.sequence}, which was not sent "
+                "(or not at that time)",
+            )
+
+    def _check_heard(self, force: Force, sent_ns: int) -> None:
+        """A force may fade when we were silent, but not while we went on sending.
+
+        All times are on our clock: the tick began `input_age_ns` or more after its command was sent. The time of arrival says
+        nothing: the message may have waited while we were paused.
+        """
+        end_ns = min(sent_ns + force.input_age_ns, self._newest_sent_ns)
+        unheard_ns = end_ns - max(sent_ns, self._sending_since_ns)
+        unheard = bool(force.flags & Flags.STALE) and unheard_ns > UNHEARD_NS
+        if unheard and not self._unheard:
+            self._break(
+                force,
+                f"the force has faded although we went on sending: for {unheard_ns / 1e9:.3g} s no command of ours "
+                "has arrived, or they are refused",
+            )
+        self._unheard = unheard
+
+    def _lose(self, force: Force, what: str) -> None:
+        self.holding = False
+        self._last = None  # another server counts its own ticks, another client its own commands
+        self._break(force, what)
+
+    def _break(self, force: Force, what: str) -> None:
+        self._breaks += 1
+        if len(self.broken) < MOST_BREAKS_TOLD:
+            self.broken.append(f"tick {force.tick}: {what}")

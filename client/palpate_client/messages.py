@@ -1,0 +1,187 @@
+"""The server's messages as typed records. Every vector is (x, y, z).
+
+Geometry and surface are decoded into `array.array`, which numpy wraps without a copy:
+`numpy.frombuffer(geometry.vertices_m, "f4").reshape(-1, 3)`.
+"""
+
+from __future__ import annotations
+
+import sys
+from array import array
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+from palpate_client import wire
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """How a client's axes and unit relate to the model's.
+
+    model position = model_origin_m + scale * rotation * (client position - client_origin_m)
+    force at the client = scale * rotation^T * force in the model
+
+    rotation: three rows, client axes to model axes; orthonormal and right-handed.
+    """
+
+    rotation: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    scale: float = 1.0
+    client_origin_m: Vector = (0.0, 0.0, 0.0)
+    model_origin_m: Vector = (0.0, 0.0, 0.0)
+
+    def direction_at_client(self, direction: Sequence[float]) -> Vector:
+        """A direction of the model, of length 1, along the client's axes."""
+        columns = zip(*self.rotation, strict=True)
+        x, y, z = (sum(r * d for r, d in zip(column, direction, strict=True)) for column in columns)
+        return x, y, z
+
+    def message(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class ToolDescription:
+    """A tool of the model: `start_m` is the point of the undeformed tissue that it touches, `normal` points outwards (unit)."""
+
+    name: str
+    start_m: Vector
+    normal: Vector
+    radius_m: float
+
+
+@dataclass(frozen=True)
+class Description:
+    """The answer to `describe`: what a client needs of it, and the whole `message`."""
+
+    tools: tuple[ToolDescription, ...]
+    period_s: float
+    hold_s: float
+    decay_s: float
+    max_force_n: float
+    max_force_rate_n_per_s: float
+    config_sha256: str
+    message: Mapping[str, Any]
+
+    def index(self, tool: str) -> int:
+        """Place of a tool in the lists of a force message. Raises ValueError with the names that there are."""
+        names = [t.name for t in self.tools]
+        if tool not in names:
+            raise ValueError(f"no tool is called {tool!r}: there are {', '.join(names)}")
+        return names.index(tool)
+
+
+def read_description(message: Mapping[str, Any]) -> Description:
+    """The description in the decoded answer to `describe`. Raises KeyError or TypeError when it lacks something."""
+    limits = message["limits"]
+    return Description(
+        tools=tuple(
+            ToolDescription(t["name"], tuple(t["start_m"]), tuple(t["normal"]), t["radius_m"])
+            for t in message["tools"]
+        ),
+        period_s=message["period_s"],
+        hold_s=message["hold_s"],
+        decay_s=message["decay_s"],
+        max_force_n=limits["max_force_n"],
+        max_force_rate_n_per_s=limits["max_force_rate_n_per_s"],
+        config_sha256=message["model"]["config_sha256"],
+        message=message,
+    )
+
+
+class Force(NamedTuple):
+    """What one tick did with one tool; the fields are those of docs/wire.md.
+
+    position_m: where the tip was applied, m, in the client's frame.
+    force_n: what the device renders, N, in the client's frame: the force of the tissue on the tool.
+    arrival_ns: when the message came, on our monotonic clock.
+    """
+
+    tick: int
+    server_time_ns: int
+    sequence: int
+    client_time_ns: int
+    input_age_ns: int
+    flags: int
+    position_m: Sequence[float]
+    force_n: Sequence[float]
+    force_scale: float
+    energy_j: float
+    arrival_ns: int
+
+
+def force_of(message: Mapping[str, Any], index: int, arrival_ns: int) -> Force:
+    """What a decoded force message says of the tool at `index`."""
+    return Force(
+        message["tick"],
+        message["server_time_ns"],
+        message["sequence"][index],
+        message["client_time_ns"][index],
+        message["input_age_ns"][index],
+        message["flags"][index],
+        message["position_m"][index],
+        message["force_n"][index],
+        message["force_scale"][index],
+        message["energy_j"][index],
+        arrival_ns,
+    )
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """The surface at rest.
+
+    vertices_m: 3 n_vertices float32, m, in the model's frame; x, y, z of vertex 0 first.
+    triangles: 3 n_triangles int32, indices of vertices; counter-clockwise seen from outside.
+    """
+
+    vertices_m: array[float]
+    triangles: array[int]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Displacement of every vertex of the geometry from rest at a tick: 3 n_vertices float32, m."""
+
+    tick: int
+    server_time_ns: int
+    displacement_m: array[float]
+
+
+def decode_geometry(payload: bytes) -> Geometry:
+    """Raises wire.MalformedMessage."""
+    message = wire.unpack(payload, wire.Kind.GEOMETRY)
+    vertices = _little_endian("f", _bytes(message, "vertices_m"))
+    triangles = _little_endian("i", _bytes(message, "triangles"))
+    if (len(vertices), len(triangles)) != (
+        3 * message.get("n_vertices", 0),
+        3 * message.get("n_triangles", 0),
+    ):
+        raise wire.MalformedMessage("wrong_shape", "n_vertices or n_triangles is not what the bytes hold")
+    return Geometry(vertices, triangles)
+
+
+def decode_surface(payload: bytes) -> Surface:
+    """Raises wire.MalformedMessage."""
+    message = wire.unpack(payload, wire.Kind.SURFACE)
+    displacement = _little_endian("f", _bytes(message, "displacement_m"))
+    try:
+        return Surface(message["tick"], message["server_time_ns"], displacement)
+    except KeyError as error:
+        raise wire.MalformedMessage("missing_field", f"{error.args[0]} is missing") from None
+
+
+def _bytes(message: Mapping[str, Any], field: str) -> bytes:
+    value = message.get(field)
+    if not isinstance(value, bytes) or len(value) % 12:
+        raise wire.MalformedMessage("wrong_type", f"{field}: expected bytes, three numbers of 4 for each row")
+    return value
+
+
+def _little_endian(typecode: str, data: bytes) -> array[Any]:
+    numbers = array(typecode, data)
+    if sys.byteorder == "big":
+        numbers.byteswap()
+    return numbers

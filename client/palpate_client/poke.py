@@ -1,0 +1,210 @@
+"""Poke a served model without a device: move one tool, check every force, print what it was like.
+
+Exit code 0: all well. 1: the contract was broken, the tool was lost or the server went away. 2: it could not start.
+3: the file of --record could not be written. 130: Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import json
+import math
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from palpate_client.arguments import add_connection_options, connection_for, positive
+from palpate_client.connection import Connection, steps
+from palpate_client.errors import ClientError, ServerGone, ToolLost
+from palpate_client.messages import Description
+from palpate_client.tool import Tool
+
+STATUS_WAIT_S = 1.0  # statuses come ten times a second
+
+
+def main() -> int:
+    options = parse_options()
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # silent unless RUST_LOG says otherwise
+    try:
+        with connection_for(options) as connection:
+            return run(connection, options)
+    except (ClientError, OSError, ValueError) as error:
+        print(f"palpate client: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:  # before anything was moved
+        return 130
+
+
+def run(connection: Connection, options: argparse.Namespace) -> int:
+    if options.record:
+        Path(options.record).touch()  # better to fail now than after the poke
+    tool = Tool(connection, options.tool, silence_s=options.silence_s)
+    messages: list[dict[str, Any]] = []
+    if options.record:
+        connection.on_force(lambda message, arrival_ns: messages.append(message))
+    statuses = Statuses()
+    connection.on_status(statuses.receive)
+    interrupted = False
+    lost: str | None = None
+    held = contextlib.ExitStack()
+    held.enter_context(tool)  # an error here is a start that failed, an error below a loss
+    before = statuses.next()
+    try:
+        with held:
+            poke(tool, motion(options), options)
+    except KeyboardInterrupt:
+        interrupted = True
+    except ServerGone as error:
+        lost = str(error)
+    except ToolLost:
+        pass  # the contract says why
+    after = statuses.newest if lost else statuses.next()
+    summary = tool.contract.summary() | {
+        "tool": tool.name,
+        "server_lost": lost,
+        "not_carried_out": not_carried_out(before, after),
+    }
+    if not summary["commands_answered"] and not lost:
+        summary["contract_broken"].append("no command was answered")
+    print(json.dumps(summary) if options.json else readable(summary), flush=True)
+    for line in summary["contract_broken"]:
+        print(f"contract broken: {line}", file=sys.stderr)
+    if lost:
+        print(f"palpate client: {lost}", file=sys.stderr)
+    unwritten = bool(options.record) and not wrote(options.record, connection.description, messages)
+    if interrupted:
+        return 130
+    if lost or summary["contract_broken"]:
+        return 1
+    return 3 if unwritten else 0
+
+
+def poke(tool: Tool, depth: Callable[[float], tuple[float, float]], options: argparse.Namespace) -> None:
+    """Send a command each period until the duration is over. Raises ServerGone or ToolLost."""
+    period_s = 1 / options.rate_hz
+    for i in steps(options.duration_s, period_s):
+        depth_m, speed_m_per_s = depth(i * period_s)
+        tool.move(tool.at_depth(depth_m), [-speed_m_per_s * n for n in tool.normal])
+
+
+def motion(options: argparse.Namespace) -> Callable[[float], tuple[float, float]]:
+    """Depth (m, inwards) and its speed (m/s) at a time (s) since the start; both motions begin at depth 0."""
+    w, amplitude_m = 2 * math.pi * options.frequency_hz, options.amplitude_m
+    if options.motion == "poke":
+        half = amplitude_m / 2
+        return lambda t: (half * (1 - math.cos(w * t)), half * w * math.sin(w * t))
+    return lambda t: (amplitude_m * math.sin(w * t), amplitude_m * w * math.cos(w * t))
+
+
+class Statuses:
+    """The server's statuses, of which only the newest counts."""
+
+    def __init__(self) -> None:
+        self.newest: dict[str, Any] | None = None
+        self._came = threading.Event()
+
+    def receive(self, status: dict[str, Any]) -> None:
+        self.newest = status
+        self._came.set()
+
+    def next(self) -> dict[str, Any] | None:
+        """One that comes from now on, or the newest when none does."""
+        self._came.clear()
+        self._came.wait(STATUS_WAIT_S)
+        return self.newest
+
+
+def not_carried_out(before: dict[str, Any] | None, after: dict[str, Any] | None) -> dict[str, int] | None:
+    """What the server counted between two statuses, of all its clients' commands; None without both statuses."""
+    if before is None or after is None:
+        return None
+    counts = {
+        f"{kind} {reason}": after[kind][reason] - before[kind][reason]
+        for kind in ("refused", "malformed")
+        for reason in after[kind]
+    }
+    counts["superseded"] = after["dropped"]["superseded"] - before["dropped"]["superseded"]
+    return {name: count for name, count in counts.items() if count}
+
+
+def wrote(path: str, description: Description, messages: list[dict[str, Any]]) -> bool:
+    """Write every tick that was heard as CSV: where each tool was applied, and its force. False, and a line, when it can't."""
+    names = [tool.name for tool in description.tools]
+    header = ["tick", "server_time_ns"]
+    for name in names:
+        header += [f"{name}.sequence", f"{name}.flags", f"{name}.force_scale"]
+        header += [f"{name}.position_{axis}_m" for axis in "xyz"]
+        header += [f"{name}.force_{axis}_n" for axis in "xyz"]
+    try:
+        with Path(path).open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(header)
+            for message in messages:
+                row = [message["tick"], message["server_time_ns"]]
+                for i in range(len(names)):
+                    row += [message["sequence"][i], message["flags"][i], message["force_scale"][i]]
+                    row += message["position_m"][i] + message["force_n"][i]
+                writer.writerow(row)
+    except OSError as error:
+        print(f"palpate client: {path}: {error.strerror}", file=sys.stderr)
+        return False
+    return True
+
+
+def readable(summary: dict[str, Any]) -> str:
+    def microseconds(seconds: float | None) -> str:
+        return "-" if seconds is None else f"{seconds * 1e6:.0f}"
+
+    def listed(counts: dict[str, int]) -> str:
+        return ", ".join(f"{name} {count}" for name, count in counts.items()) or "none"
+
+    trip = summary["round_trip_s"]
+    not_done = summary["not_carried_out"]
+    return "\n".join(
+        (
+            f"tool               {summary['tool']}",
+            f"commands           {summary['commands_sent']} sent, {summary['commands_answered']} answered, "
+            f"{summary['commands_unanswered']} not",
+            f"not carried out    {'unknown' if not_done is None else listed(not_done)} (by the server's count, of all "
+            "clients' commands)",
+            f"forces             {summary['forces_received']} received, {summary['forces_lost']} lost",
+            f"round trip         p50 {microseconds(trip['p50'])}, p99 {microseconds(trip['p99'])}, "
+            f"p99.9 {microseconds(trip['p99_9'])}, longest {microseconds(trip['max'])} microseconds",
+            f"largest force      {summary['largest_force_n']:.4g} N",
+            f"flags (ticks)      {listed(summary['flags'])}",
+            f"contract           {'BROKEN' if summary['contract_broken'] else 'held'}",
+        )
+    )
+
+
+def parse_options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="palpate client", description=(__doc__ or "").splitlines()[0])
+    add_connection_options(parser)
+    parser.add_argument("--tool", help="name of the tool to move (default: the model's first)")
+    parser.add_argument(
+        "--motion",
+        choices=("poke", "sine"),
+        default="poke",
+        help="poke: inwards and back; sine: about the rest position (%(default)s)",
+    )
+    for name, default, text in (
+        ("--amplitude-m", 0.005, "largest depth, m"),
+        ("--frequency-hz", 1.0, "pokes a second"),
+        ("--duration-s", 5.0, "how long, s"),
+        ("--rate-hz", 1000.0, "commands a second"),
+        ("--silence-s", 0.5, "without a force for so long, give up, s"),
+    ):
+        parser.add_argument(name, type=positive, default=default, help=f"{text} (%(default)s)")
+    parser.add_argument("--record", metavar="FILE.csv", help="write every tick: position applied and force")
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,191 @@
+"""A tool: held from entering to leaving, moved by commands, felt by forces."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any
+
+from palpate_client.connection import Connection, Subscription, steps
+from palpate_client.contract import Contract
+from palpate_client.errors import ServerGone, ToolLost
+from palpate_client.messages import Force, Frame, Vector
+
+NO_FORCE: Vector = (0.0, 0.0, 0.0)
+SETTLE_S = 0.5  # the server's deadlines follow our commands within a quarter of a second
+MEASURE_S = 1.0
+LAST_ANSWERS_S = 0.05  # how long answers may still be under way
+FIRST_FORCE_S = 3.0
+
+
+class Tool:
+    """One tool of a connection; use it in a `with` statement, one at a time for each connection.
+
+    Entering acquires the tool, leaving releases all tools of the client.
+
+    Parameters
+    ----------
+    name: the tool's name; without it, the model's first.
+    frame: how the client's axes and unit relate to the model's.
+    silence_s: `move` gives up when no force has come for this long.
+
+    Attributes
+    ----------
+    home_m: (3,) where the tip touches the undeformed tissue without pressing, m, in the client's frame.
+    normal: (3,) outward normal there, of length 1, in the client's frame.
+    limits: what holds for us, by name; docs/wire.md says what they mean.
+    warnings: the server's, for the user.
+    contract: what the server promises, checked for every force.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        name: str | None = None,
+        *,
+        frame: Frame | None = None,
+        silence_s: float = 1.0,
+    ) -> None:
+        tools = connection.description.tools
+        self.name = tools[0].name if name is None else name
+        described = tools[connection.description.index(self.name)]
+        self.frame = frame or Frame()
+        self.normal = self.frame.direction_at_client(described.normal)
+        self.home_m: Vector = described.start_m
+        self.limits: dict[str, float] = {}
+        self.warnings: list[str] = []
+        self.contract = Contract(connection.description)
+        self.newest: Force | None = None  # that keeps the contract
+        self._connection = connection
+        self._silence_s = silence_s
+        self._since_s = time.monotonic()
+        self._rendered_tick: int | None = None
+        self._forces: Subscription = None
+
+    def __enter__(self) -> Tool:
+        """Raises Refused, ServerGone or Incompatible."""
+        self._acquire()
+        self._forces = self._connection.on_tool_force(self.name, self._on_force)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            time.sleep(LAST_ANSWERS_S)
+        lost = not self.contract.holding
+        self.contract.released()
+        self._forces.undeclare()
+        try:
+            self._connection.check()
+            if not lost:
+                self._connection.control("release")
+        except ServerGone:
+            if error is None:  # otherwise the first error tells more
+                raise
+
+    def move(self, position_m: Sequence[float], velocity_m_per_s: Sequence[float] | None = None) -> None:
+        """Send where the tip is, m, and how fast it moves, m/s, in our frame: best once each period.
+
+        With the velocity, the server carries the motion on when a command is late. Raises ServerGone or ToolLost: a device
+        renders zero from then on.
+        """
+        self._connection.check()
+        if not self.contract.holding:
+            reason = self.contract.broken[-1] if self.contract.broken else "it was released"
+            raise ToolLost(f"the tool {self.name!r} is no longer ours: {reason}")
+        if self.silent_s > max(self._silence_s, 0.0 if self.newest else FIRST_FORCE_S):
+            raise ServerGone(f"the server is silent: no force for {self.silent_s:.3g} s")
+        velocity = None if velocity_m_per_s is None else {self.name: list(velocity_m_per_s)}
+        self._connection.send(
+            {self.name: list(position_m)}, velocity, self._rendered_tick, self.contract.on_sent
+        )
+
+    def take_force(self) -> Vector:
+        """What a device renders now, N, in our frame: the newest force while it is fresh, and zero otherwise.
+
+        Zero before the first force, when none that keeps the contract has come for `hold_s`, and when the tool or the
+        server is lost. The next command tells the server which force was rendered.
+        """
+        force = self.newest
+        fresh = force is not None and self.silent_s <= self._connection.description.hold_s
+        if force is None or not fresh or not self.contract.holding:
+            self._rendered_tick = None
+            return NO_FORCE
+        self._rendered_tick = force.tick
+        x, y, z = force.force_n
+        return x, y, z
+
+    @property
+    def silent_s(self) -> float:
+        """Time since the newest force that keeps the contract, s; before the first, since the tool was acquired."""
+        return time.monotonic() - self._since_s
+
+    def at_depth(self, depth_m: float) -> list[float]:
+        """The point this far inside the undeformed surface, straight below `home_m`; m, in our frame and our unit."""
+        return [h - depth_m * n for h, n in zip(self.home_m, self.normal, strict=True)]
+
+    def use_device(self, profile: str, damping_n_s_per_m: float) -> float:
+        """Tell the server which device renders, so that its limits hold and passivity control is on.
+
+        Keeps the tip at `home_m` for 1.5 s to measure how old a force is when it is rendered: the 99th percentile of the
+        round trip, and up to a period until the next step. Returns that time, s. Then acquires the tool again; `warnings`
+        are the server's about this device. Raises what `move` raises, and Refused.
+        """
+        period_s = self._connection.description.period_s
+        for duration_s in (SETTLE_S, MEASURE_S):
+            self.contract.measure_anew()
+            for _ in steps(duration_s, period_s):
+                self.move(self.home_m)
+        time.sleep(LAST_ANSWERS_S)
+        round_trip_s = self.contract.round_trip_s(0.99)
+        if round_trip_s is None:
+            raise ServerGone("no command was answered")
+        round_trip_s += period_s
+        self.contract.released()
+        self._acquire(device=profile, device_damping_n_s_per_m=damping_n_s_per_m, round_trip_s=round_trip_s)
+        return round_trip_s
+
+    def _acquire(self, **device: Any) -> None:
+        answer = self._connection.control("acquire", tools=[self.name], frame=self.frame.message(), **device)
+        agreed = answer["tools"][self.name]
+        self.limits = agreed["limits"]
+        x, y, z = agreed["home_m"]
+        self.home_m = x, y, z
+        self.warnings = answer["warnings"]
+        self.newest = None
+        self._since_s = time.monotonic()
+        self._rendered_tick = None
+        self.contract.acquired(self.limits["max_force_n"])
+
+    def _on_force(self, force: Force) -> None:
+        if self.contract.on_force(force):  # what may not be rendered counts as silence
+            self._since_s = force.arrival_ns * 1e-9
+            self.newest = force
+
+
+class OneSidedContact:
+    """Makes a contact with tissue one-sided: a device is pushed out of it, and never pulled in.
+
+    The body of a patch model follows the tip in every direction, also outwards. So while the hand is outside of the tissue,
+    the tip is left at `home_m` and nothing is rendered. It enters where the hand enters. After a silence the tip stays out
+    until the hand has left the tissue, so that no force comes back with a jump.
+    """
+
+    def __init__(self, tool: Tool, hold_s: float) -> None:
+        self._tool = tool
+        self._hold_s = hold_s
+        self._let_go = True  # a hand that begins in the tissue has to leave it first
+        self._entered: Sequence[float] = tool.home_m  # where the hand went in, on the undeformed surface
+
+    def tip(self, position_m: Sequence[float]) -> tuple[list[float], bool]:
+        """Where the tip is for a hand at a position, m, in our frame; and whether it touches."""
+        home, normal = self._tool.home_m, self._tool.normal
+        depth = sum((h - p) * n for h, p, n in zip(home, position_m, normal, strict=True))
+        silent = self._tool.silent_s > self._hold_s
+        self._let_go = silent or (self._let_go and depth > 0)
+        if self._let_go or depth <= 0:
+            self._entered = [p + depth * n for p, n in zip(position_m, normal, strict=True)]
+            return list(home), False
+        return [h + p - e for h, p, e in zip(home, position_m, self._entered, strict=True)], True
