@@ -26,13 +26,13 @@ import numpy as np
 import psutil
 
 from palpate.model_file import load_model, save_model
-from palpate_server import wire
+from palpate_client import wire
 from palpate_server.diagnostics.round_trips import free_endpoint
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.realtime import shared_memory
 from palpate_server.realtime.safety import Limits
 from palpate_server.session import transport
-from palpate_server.session.server import Server
+from palpate_server.session.server import Server, ServerOptions
 
 CLIENT = Path(__file__).parents[1] / "client_examples" / "headless_client.py"
 SAMPLE_S = 10.0
@@ -79,13 +79,14 @@ def serve(path: Path, endpoint: str, out: Path) -> None:
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     limits = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
     with transport.open_session(endpoint, None) as session:
-        server = Server(load_model(path), limits, session, wire.Keys("main"), path.parent, surface_hz=60.0)
+        options = ServerOptions(limits, path.parent, surface_hz=60.0)
+        server = Server(load_model(path), session, wire.Keys("main"), options)
         server.start()
         print("serving", flush=True)
         while not stop.wait(0.1):
             server.publish_status()
         server.stop()
-    np.savez(out, histograms=server.service.memory.histograms, longest_ns=server.service.memory.longest_ns)
+    np.savez(out, histograms=server.state.memory.histograms, longest_ns=server.state.memory.longest_ns)
 
 
 def run(server: int, endpoint: str, seconds: float) -> list[tuple[float, float]]:
@@ -158,8 +159,8 @@ def report(summary: dict[str, Any], status: dict[str, Any], surfaces: int) -> No
     print(f"unexplained: {unexplained}")
     print(f"forces: {summary['forces_received']} received, {summary['forces_lost']} lost, ", end="")
     print(f"{status['dropped']['unsent_force']} not sent; surfaces: {surfaces}")
-    for name, contact in status["contacts"].items():
-        print(f"success rate of {name} since the start: {contact['success_rate_since_start']:.5f}")
+    for name, tool in status["tools"].items():
+        print(f"success rate of {name} since the start: {tool['success_rate_since_start']:.5f}")
     keys = ("ticks", "ticks_on_arrival", "late_ticks", "caught_up_ticks", "skipped_ticks", "faults")
     print("ticks: " + ", ".join(f"{key} {status[key]}" for key in keys))
     for key in ("timer_lateness_s", "tick_lateness_s", "compute_time_s", "input_age_s"):

@@ -21,7 +21,9 @@ SCHEMA_VERSION = 2
 ENCODING = f"application/msgpack;palpate.v{SCHEMA_VERSION}"
 DEFAULT_SESSION = "main"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-LEASE_MS = 1000  # Zenoh's lease on a link: how long a peer may stay silent before it counts as gone
+# Zenoh's lease on a link, ms: how long a peer may stay silent before it counts as gone; and its signs of life in that time.
+LEASE_MS = 4000
+KEEP_ALIVES = 8
 
 # The largest payloads that the server reads, and the largest message that its Zenoh session puts together.
 MAX_COMMAND_BYTES = 4096

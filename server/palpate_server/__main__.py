@@ -1,4 +1,4 @@
-"""`python -m palpate_server MODEL.npz`: serve a reduced model until SIGINT or SIGTERM."""
+"""`python -m palpate_server MODEL.npz`: serve a reduced model until a signal."""
 
 from __future__ import annotations
 
@@ -16,21 +16,51 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import zenoh
 
-from palpate.model_file import ModelFileError, load_model
-from palpate_server import wire
+from palpate.model_file import ModelFileError, ReducedModel, load_model
+from palpate_client.wire import Keys
 from palpate_server.arguments import index, need, positive
 from palpate_server.realtime.safety import Limits, least_force_rate
-from palpate_server.session import transport
-from palpate_server.session.server import FASTEST_SURFACE_HZ, USUAL_SURFACE_HZ, serve
+from palpate_server.session import log_limit, transport
+from palpate_server.session.loading import accuracy_warnings
+from palpate_server.session.log_limit import printable
+from palpate_server.session.server import FASTEST_SURFACE_HZ, USUAL_SURFACE_HZ, ServerOptions, serve
+
+log = logging.getLogger("palpate_server")
 
 EXIT_REFUSED = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = _parser()
-    options = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    options = _parser().parse_args(arguments)
+    log_limit.set_up()
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # silent unless RUST_LOG says otherwise
+    stop = _stop_at_signals()
+    try:
+        keys = Keys(options.session)
+        how = _server_options(options)
+        model = load_model(options.model)
+        for warning in accuracy_warnings(model):
+            log.warning("%s", warning)
+        with transport.open_session(options.listen, options.zenoh_config) as session:
+            serve(model, session, keys, how, stop, lambda: _announce(model, keys, options))
+    except (OSError, ModelFileError, transport.TransportError, ValueError) as error:
+        print(printable(f"palpate serve: {error}"), file=sys.stderr)
+        return EXIT_REFUSED
+    print("stopped", flush=True)
+    return 0
+
+
+def _stop_at_signals() -> threading.Event:
+    """An event that SIGINT, SIGTERM and SIGHUP set; a hang-up that is ignored, as under nohup, stays ignored."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def _server_options(options: argparse.Namespace) -> ServerOptions:
+    """Raises ValueError for limits that can't be kept, and for a folder that is missing or can't be written to."""
     limits = Limits(
         options.max_force_n,
         options.max_force_rate_n_per_s,
@@ -40,55 +70,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     least = least_force_rate(limits.max_force_n)
     if limits.max_force_rate_n_per_s < least:
-        print(
-            f"palpate serve: --max-force-rate-n-per-s is {limits.max_force_rate_n_per_s:g}: expected at least "
-            f"{least:g}, so that {limits.max_force_n:g} N can fade in time when a client is gone",
-            file=sys.stderr,
+        raise ValueError(
+            f"--max-force-rate-n-per-s is {limits.max_force_rate_n_per_s:g}: expected at least "
+            f"{least:g}, so that {limits.max_force_n:g} N can fade in time when a client is gone"
         )
-        return EXIT_REFUSED
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    try:
-        keys = wire.Keys(options.session)
-        model = load_model(options.model)
-        models = options.models or options.model.parent
-        if not models.is_dir():
-            raise ValueError(f"--models {models}: no such folder")
-        if options.black_box is not None:
-            _prepare_folder("--black-box", options.black_box)
-        if options.recordings is not None:
-            need("mcap", "recorder", "palpate serve --recordings")
-            _prepare_folder("--recordings", options.recordings)
-        with transport.open_session(options.listen, options.zenoh_config) as session:
-            where = options.zenoh_config or options.listen
-            contacts = ", ".join(contact.name for contact in model.contacts)
+    models = options.models or options.model.parent
+    if not models.is_dir():
+        raise ValueError(f"--models {models}: no such folder")
+    if options.black_box is not None:
+        _prepare_folder("--black-box", options.black_box)
+    if options.recordings is not None:
+        need("mcap", "recorder", "palpate serve --recordings")
+        _prepare_folder("--recordings", options.recordings)
+    return ServerOptions(
+        limits, models, options.recordings, options.black_box, options.surface_hz, options.cpu
+    )
 
-            def announce() -> None:
-                print(
-                    f"serving {model.name} (order {model.order}, contacts: {contacts}) "
-                    f"as {keys.prefix} on {where}; Ctrl-C stops",
-                    flush=True,
-                )
 
-            serve(
-                model,
-                limits,
-                session,
-                keys,
-                stop,
-                announce,
-                models,
-                options.black_box,
-                options.surface_hz,
-                options.cpu,
-                options.recordings,
-            )
-    except (OSError, ModelFileError, transport.TransportError, ValueError) as error:
-        print(f"palpate serve: {error}", file=sys.stderr)
-        return EXIT_REFUSED
-    print("stopped", flush=True)
-    return 0
+def _announce(model: ReducedModel, keys: Keys, options: argparse.Namespace) -> None:
+    tools = ", ".join(contact.name for contact in model.contacts)
+    text = f"serving {model.name} (order {model.order}, tools: {tools}) as {keys.prefix}"
+    print(printable(f"{text} on {options.zenoh_config or options.listen}; Ctrl-C stops"), flush=True)
 
 
 def _prepare_folder(option: str, folder: Path) -> None:
@@ -104,8 +106,8 @@ def _prepare_folder(option: str, folder: Path) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="palpate serve",
-        description="Serve a reduced tissue model over Zenoh: displacements in, forces out, 1000 times a second.",
-        epilog="The messages are described in docs/wire.md. SIGINT and SIGTERM stop the server cleanly.",
+        description="Serve a reduced tissue model over Zenoh: positions in, forces out, 1000 times a second.",
+        epilog="The messages are described in docs/wire.md. SIGINT, SIGTERM and SIGHUP stop the server cleanly.",
     )
     parser.add_argument("model", type=Path, metavar="MODEL.npz", help="model file made by `palpate build`")
     parser.add_argument(
@@ -157,7 +159,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="N",
         help="keep the threads that run ticks on this processor (default: where the system puts them)",
     )
-    limits = parser.add_argument_group("limits", "what no client can exceed, for each contact")
+    limits = parser.add_argument_group("limits", "what no client can exceed, for each tool")
     limits.add_argument(
         "--max-force-n", type=positive, default=10.0, metavar="N", help="(default: %(default)s)"
     )
@@ -180,7 +182,7 @@ def _parser() -> argparse.ArgumentParser:
         type=positive,
         default=0.1,
         metavar="M",
-        help="longest displacement of a tip (default: %(default)s)",
+        help="farthest that a tip moves from its start (default: %(default)s)",
     )
     return parser
 

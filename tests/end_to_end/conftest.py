@@ -207,6 +207,11 @@ def _wait_for() -> Callable[..., Any]:
 # The client
 
 
+def request(**fields: Any) -> dict[str, Any]:
+    """A control request of this schema version."""
+    return {"kind": "request", "schema_version": 2, **fields}
+
+
 @dataclass
 class RawClient:
     """A client that can misbehave: it sends any bytes, and keeps whatever comes.
@@ -260,22 +265,23 @@ class RawClient:
                 return reply.ok is not None, msgpack.unpackb(result.payload.to_bytes())
         raise TimeoutError(f"no answer to {key}")
 
-    def control(self, action: str, request: object = None) -> tuple[bool, dict[str, Any]]:
-        return self.query(f"control/{self.name}/{action}", request)
+    def control(self, action: str, **fields: Any) -> tuple[bool, dict[str, Any]]:
+        return self.query(f"control/{self.name}/{action}", request(**fields))
 
-    def acquire(self, *contacts: str) -> tuple[bool, dict[str, Any]]:
-        return self.control("acquire", {"contacts": list(contacts)})
+    def acquire(self, *tools: str, **fields: Any) -> tuple[bool, dict[str, Any]]:
+        return self.control("acquire", tools=list(tools), **fields)
 
     def record(self, file: str) -> dict[str, Any]:
-        """Begin a recording of the server's, and wait until a status has told of its first tick; the answer.
+        """Begin a recording of the server's, and wait until a status has told of its first tick; the report on it.
 
         That of the recording's beginning may not: it is sent after the answer, with the tick that is the next one.
         """
-        granted, answer = self.control("record", {"file": file})
+        granted, answer = self.control("record", file=file)
         assert granted, answer
         ticks = self.next_status()["ticks"]
         self.status_when(lambda status: status["ticks"] > ticks, "a status that tells of a recorded tick")
-        return answer
+        report: dict[str, Any] = answer["recording"]
+        return report
 
     def put(self, payload: bytes) -> None:
         """To the server's commands. None is dropped, and they arrive in order, but when they do nobody says."""
@@ -287,26 +293,27 @@ class RawClient:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
-    def command(self, displacement_m: dict[str, list[float]], sequence: int | None = None) -> int:
+    def command(self, position_m: dict[str, list[float]], sequence: int | None = None) -> int:
         if sequence is None:
             self.sequence += 1
             sequence = self.sequence
         message = {
+            "kind": "command",
             "sequence": sequence,
             "client_time_ns": time.monotonic_ns(),
-            "displacement_m": displacement_m,
+            "position_m": position_m,
         }
         self.put(msgpack.packb(message))
         return sequence
 
     @contextmanager
-    def pressing(self, displacement_m: dict[str, list[float]]) -> Iterator[None]:
+    def pressing(self, position_m: dict[str, list[float]]) -> Iterator[None]:
         """A command each millisecond from a thread of its own."""
         stop = threading.Event()
 
         def press() -> None:
             while not stop.wait(0.001):
-                self.command(displacement_m)
+                self.command(position_m)
 
         thread = threading.Thread(target=press)
         thread.start()

@@ -6,8 +6,11 @@ import ast
 import json
 import math
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -17,14 +20,46 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.model_file import ReducedModel
+from palpate_client.wire import (
+    ACTIONS,
+    DEFAULT_ENDPOINT,
+    DROPPED,
+    ENCODING,
+    KEEP_ALIVES,
+    LEASE_MS,
+    MALFORMED,
+    MAX_COMMAND_BYTES,
+    MAX_MESSAGE_BYTES,
+    MAX_REQUEST_BYTES,
+    NOT_GRANTED,
+    REFUSED,
+    SCHEMA_VERSION,
+    Flags,
+    Keys,
+    Kind,
+    MalformedMessage,
+    is_name,
+    pack,
+    unpack,
+)
 from palpate_server import wire
-from palpate_server.realtime.safety import Flags, Limits
+from palpate_server.realtime.safety import Limits
 from palpate_server.recording.recorder import Recorder
-from palpate_server.session import transport
-from palpate_server.session.state import Service
+from palpate_server.session.admission import out_of_range
+from palpate_server.session.fields import read_request
+from palpate_server.session.leases import Refused
+from palpate_server.session.state import SessionState
+from palpate_server.session.status import description, status
 
 PAGE = Path(__file__).parents[2] / "docs" / "wire.md"
-GOOD = {"sequence": 3, "client_time_ns": 5, "displacement_m": {"tip": [0.0, 1e-3, -2]}}
+SERVER = Path(wire.__file__).parent
+GOOD: dict[str, Any] = {
+    "kind": "command",
+    "sequence": 3,
+    "client_time_ns": 5,
+    "position_m": {"tip": [0.0, 1e-3, -2]},
+}
+MOVING: dict[str, Any] = GOOD | {"velocity_m_per_s": {"tip": [1.0, 2, 3]}, "rendered_tick": 7}
 
 json_like = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary(),
@@ -33,48 +68,111 @@ json_like = st.recursive(
 )
 
 
+def without(message: dict[str, Any], field: str) -> dict[str, Any]:
+    return {name: value for name, value in message.items() if name != field}
+
+
+def with_unknown_field(value: bytes) -> bytes:
+    """A good command with one more field, whose value is given as it is encoded."""
+    return bytes([0x80 + len(GOOD) + 1]) + msgpack.packb(GOOD)[1:] + msgpack.packb("later") + value
+
+
+def test_the_facts_of_the_wire_need_neither_numpy_nor_numba() -> None:
+    script = "import sys, palpate_client.wire; sys.exit(bool({'numpy', 'numba'} & set(sys.modules)))"
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
+
+
 def test_a_command_is_read_as_it_was_meant() -> None:
-    command = wire.decode_command(msgpack.packb(GOOD))
-    assert command == wire.Command(3, 5, {"tip": (0.0, 1e-3, -2.0)}, {"tip": wire.STILL})
-    assert wire.is_finite(command)
+    assert wire.decode_command(pack(GOOD)) == wire.Command(
+        3, 5, {"tip": (0.0, 1e-3, -2.0)}, {"tip": wire.STILL}
+    )
+    assert wire.decode_command(pack(MOVING)) == wire.Command(
+        3, 5, {"tip": (0.0, 1e-3, -2.0)}, {"tip": (1.0, 2.0, 3.0)}, 7
+    )
 
 
-def test_unknown_fields_are_ignored_so_that_the_schema_can_grow() -> None:
-    assert wire.decode_command(msgpack.packb(GOOD | {"later": [1]})).sequence == 3
+@pytest.mark.parametrize("field", ["velocity_m_per_s", "rendered_tick"])
+def test_nil_in_an_optional_field_is_the_field_left_out(field: str) -> None:
+    left_out, nil = pack(without(MOVING, field)), pack(MOVING | {field: None})
+    assert wire.decode_command(nil) == wire.decode_command(left_out)
+
+
+def test_a_velocity_map_may_be_empty_or_name_some_of_the_tools() -> None:
+    two = GOOD | {"position_m": {"a": [0, 0, 0], "b": [0, 0, 0]}}
+    assert wire.decode_command(pack(GOOD | {"velocity_m_per_s": {}})) == wire.decode_command(pack(GOOD))
+    velocity = wire.decode_command(pack(two | {"velocity_m_per_s": {"b": [0, 0, 1]}})).velocity_m_per_s
+    assert velocity == {"a": wire.STILL, "b": (0.0, 0.0, 1.0)}
+
+
+@pytest.mark.parametrize(
+    "value", [b"\xc0", b"\x91\x01", msgpack.packb(msgpack.ExtType(5, b"x")), b"\xcf" + b"\xff" * 8]
+)
+def test_unknown_fields_are_ignored_so_that_the_schema_can_grow(value: bytes) -> None:
+    assert wire.decode_command(with_unknown_field(value)) == wire.decode_command(pack(GOOD))
+
+
+def test_of_a_field_that_stands_twice_the_last_one_counts() -> None:
+    sequence = msgpack.packb("sequence")
+    twice = bytes([0x80 + len(GOOD) + 1]) + sequence + b"\x01" + msgpack.packb(GOOD)[1:]
+    assert wire.decode_command(twice).sequence == GOOD["sequence"]
+
+
+def test_the_order_of_fields_does_not_matter() -> None:
+    backwards = dict(reversed(GOOD.items()))
+    assert wire.decode_command(pack(backwards)) == wire.decode_command(pack(GOOD))
 
 
 @pytest.mark.parametrize(
     ("payload", "reason"),
     [
-        (b"", "not_msgpack"),
+        (b"", "not_msgpack"),  # also that of a DELETE
         (b"\xc1", "not_msgpack"),
-        (msgpack.packb(GOOD)[:-3], "not_msgpack"),
-        (msgpack.packb(GOOD) + b"\x00", "not_msgpack"),
+        (pack(GOOD)[:-3], "not_msgpack"),
+        (pack(GOOD) + b"\x00", "not_msgpack"),
+        (with_unknown_field(b"\xa2\xff\xfe"), "not_msgpack"),  # text that is not UTF-8
         (b"\x91" * 4000, "not_msgpack"),
-        (msgpack.packb([1, 2]), "not_a_map"),
         (msgpack.packb({1: 2}), "not_msgpack"),
+        (msgpack.packb([1, 2]), "not_a_map"),
         (bytes(10_000_000), "too_large"),
-        (msgpack.packb({k: v for k, v in GOOD.items() if k != "sequence"}), "missing_field"),
-        (msgpack.packb(GOOD | {"sequence": True}), "wrong_type"),
-        (msgpack.packb(GOOD | {"sequence": -1}), "wrong_type"),
-        (msgpack.packb(GOOD | {"sequence": 2**63}), "wrong_type"),
-        (msgpack.packb(GOOD | {"client_time_ns": 1.5}), "wrong_type"),
-        (msgpack.packb(GOOD | {"displacement_m": [0, 0, 0]}), "wrong_type"),
-        (msgpack.packb(GOOD | {"displacement_m": {}}), "wrong_shape"),
-        (msgpack.packb(GOOD | {"displacement_m": {"tip": [0, 0]}}), "wrong_shape"),
-        (msgpack.packb(GOOD | {"displacement_m": {"tip": [0, 0, 0, 0]}}), "wrong_shape"),
-        (msgpack.packb(GOOD | {"displacement_m": {"tip": [0, 0, "0"]}}), "wrong_type"),
-        (msgpack.packb(GOOD | {"displacement_m": {"tip": [0, 0, None]}}), "wrong_type"),
-        (msgpack.packb(GOOD | {"velocity_m_per_s": {"tip": [0, 0]}}), "wrong_shape"),
-        (msgpack.packb(GOOD | {"velocity_m_per_s": {"other": [0, 0, 0]}}), "wrong_shape"),
-        (msgpack.packb(GOOD | {"rendered_tick": -1}), "wrong_type"),
+        (pack(without(GOOD, "kind")), "wrong_kind"),
+        (pack(GOOD | {"kind": "force"}), "wrong_kind"),
+        (pack(GOOD | {"kind": ["command"]}), "wrong_kind"),
+        (pack(without(GOOD, "sequence")), "missing_field"),
+        (pack(without(GOOD, "position_m")), "missing_field"),
+        (pack(GOOD | {"sequence": True}), "wrong_type"),
+        (pack(GOOD | {"sequence": None}), "wrong_type"),
+        (pack(GOOD | {"sequence": -1}), "wrong_type"),
+        (pack(GOOD | {"sequence": 2**63}), "wrong_type"),
+        (pack(GOOD | {"client_time_ns": 1.5}), "wrong_type"),
+        (pack(GOOD | {"client_time_ns": 2**64 - 1}), "wrong_type"),
+        (pack(GOOD | {"position_m": [0, 0, 0]}), "wrong_type"),
+        (pack(GOOD | {"position_m": None}), "wrong_type"),
+        (pack(GOOD | {"position_m": {}}), "wrong_shape"),
+        (pack(GOOD | {"position_m": {"tip": [0, 0]}}), "wrong_shape"),
+        (pack(GOOD | {"position_m": {"tip": [0, 0, 0, 0]}}), "wrong_shape"),
+        (pack(GOOD | {"position_m": {"tip": [0, 0, "0"]}}), "wrong_type"),
+        (pack(GOOD | {"position_m": {"tip": [0, 0, None]}}), "wrong_type"),
+        (pack(GOOD | {"position_m": {"tip": [0, 0, True]}}), "wrong_type"),
+        (pack(GOOD | {"velocity_m_per_s": {"tip": [0, 0]}}), "wrong_shape"),
+        (pack(GOOD | {"velocity_m_per_s": {"other": [0, 0, 0]}}), "wrong_shape"),
+        (pack(GOOD | {"rendered_tick": -1}), "wrong_type"),
+        (pack(GOOD | {"rendered_tick": 2**63}), "wrong_type"),
     ],
 )
 def test_a_malformed_command_is_named_by_what_is_wrong(payload: bytes, reason: str) -> None:
-    with pytest.raises(wire.MalformedMessage) as caught:
+    with pytest.raises(MalformedMessage) as caught:
         wire.decode_command(payload)
     assert caught.value.reason == reason
-    assert reason in wire.MALFORMED
+    assert reason in MALFORMED
+
+
+def test_the_largest_integers_are_read() -> None:
+    largest = GOOD | {"sequence": 2**63 - 1, "client_time_ns": 2**63 - 1, "rendered_tick": 2**63 - 1}
+    command = wire.decode_command(pack(largest))
+    assert (command.sequence, command.client_time_ns, command.rendered_tick) == (2**63 - 1,) * 3
+    assert wire.decode_command(pack(GOOD | {"position_m": {"tip": [2**64 - 1, 0, 0]}})).position_m == {
+        "tip": (2.0**64, 0.0, 0.0)
+    }
 
 
 @settings(max_examples=300, deadline=None)
@@ -82,73 +180,118 @@ def test_a_malformed_command_is_named_by_what_is_wrong(payload: bytes, reason: s
 def test_random_bytes_are_malformed_or_a_command_but_nothing_else(payload: bytes) -> None:
     try:
         wire.decode_command(payload)
-    except wire.MalformedMessage as error:
-        assert error.reason in wire.MALFORMED
+    except MalformedMessage as error:
+        assert error.reason in MALFORMED
 
 
 @settings(max_examples=300, deadline=None)
-@given(field=st.sampled_from(sorted(GOOD)), value=json_like, name=st.text(max_size=5))
+@given(field=st.sampled_from(sorted(MOVING)), value=json_like, name=st.text(max_size=5))
 def test_any_value_in_any_field_gives_a_whole_command_or_a_reason(
     field: str, value: object, name: str
 ) -> None:
     for replacement in (value, {name: value}, {name: [value, 0.0, value]}):
         try:
-            command = wire.decode_command(msgpack.packb(GOOD | {field: replacement}))
-        except wire.MalformedMessage as error:
-            assert error.reason in wire.MALFORMED
+            command = wire.decode_command(msgpack.packb(MOVING | {field: replacement}))
+        except MalformedMessage as error:
+            assert error.reason in MALFORMED
         else:
             assert 0 <= command.sequence < 2**63
-            for vector in command.displacement_m.values():
+            assert command.velocity_m_per_s.keys() == command.position_m.keys()
+            for vector in command.position_m.values():
                 assert [type(number) for number in vector] == [float] * 3
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_numbers_that_are_not_finite_are_recognized(bad: float) -> None:
-    for axis in range(3):
-        vector = [0.0, 0.0, 0.0]
-        vector[axis] = bad
-        command = wire.decode_command(msgpack.packb(GOOD | {"displacement_m": {"tip": vector}}))
-        assert not wire.is_finite(command)
+@pytest.mark.parametrize(
+    ("request_", "reason"),
+    [
+        (b"", "wrong_version"),
+        (pack({}), "wrong_version"),
+        (pack({"contacts": ["tip"]}), "wrong_version"),  # of schema version 1
+        (pack({"kind": "request", "schema_version": 1}), "wrong_version"),
+        (pack({"kind": "request", "schema_version": None}), "wrong_version"),
+        (pack({"kind": "request", "schema_version": 2.0}), "wrong_version"),
+        (pack({"kind": "request", "schema_version": 3}), "wrong_version"),
+        (pack({"schema_version": 2}), "wrong_kind"),
+        (pack({"kind": "command", "schema_version": 2}), "wrong_kind"),
+        (msgpack.packb([2]), "not_a_map"),
+        (b"\xc1", "not_msgpack"),
+    ],
+)
+def test_a_request_of_another_version_or_kind_is_refused(request_: bytes, reason: str) -> None:
+    with pytest.raises((Refused, MalformedMessage)) as caught:
+        read_request(request_)
+    assert caught.value.reason == reason  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("field", ["displacement_m", "velocity_m_per_s"])
-@pytest.mark.parametrize(("value", "in_range"), [(1e3, True), (1000.1, False), (1.797e308, False)])
-def test_numbers_that_no_device_gives_are_recognized(field: str, value: float, in_range: bool) -> None:
+def test_a_client_of_version_1_is_told_what_to_do() -> None:
+    with pytest.raises(Refused, match="upgrade") as caught:
+        read_request(b"")
+    assert all(word in str(caught.value) for word in ("tools", "position_m", "force_n"))
+
+
+def test_a_message_of_another_kind_is_not_taken_for_one() -> None:
+    encoder = wire.ForceEncoder(1)
+    force = encoder.encode(0, 0, *no_ticks(1))
+    assert unpack(force, Kind.FORCE)["tick"] == 0
+    with pytest.raises(MalformedMessage) as caught:
+        unpack(force, Kind.STATUS)
+    assert caught.value.reason == "wrong_kind"
+
+
+def command_with(field: str, vector: list[float]) -> wire.Command:
+    return wire.decode_command(pack(MOVING | {field: {"tip": vector}}))
+
+
+@pytest.mark.parametrize("field", ["position_m", "velocity_m_per_s"])
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        (math.nan, "not_finite"),
+        (math.inf, "not_finite"),
+        (1e3, None),
+        (1000.1, "out_of_range"),
+        (1.797e308, "out_of_range"),
+    ],
+)
+def test_numbers_that_no_device_gives_are_recognized(field: str, value: float, reason: str | None) -> None:
     for axis in range(3):
         for sign in (-1.0, 1.0):
             vector = [0.0, 0.0, 0.0]
             vector[axis] = sign * value
-            command = wire.decode_command(msgpack.packb(GOOD | {field: {"tip": vector}}))
-            assert wire.is_finite(command)
-            assert wire.is_in_range(command) == in_range
+            assert out_of_range(command_with(field, vector)) == reason
 
 
-@pytest.mark.parametrize("name", ["", "a/b", "*", "a b", "@a", "x" * 65, None, 3])
+@pytest.mark.parametrize("name", ["", "a/b", "*", "a b", "@a", "x" * 65, "a\n", "ä", None, 3])
 def test_names_that_could_change_a_key_expression_are_refused(name: object) -> None:
-    assert not wire.is_name(name)
+    assert not is_name(name)
+
+
+def no_ticks(n: int) -> tuple[Any, Any]:
+    return np.zeros((n, 4), np.int64), np.zeros((n, 8))
 
 
 @settings(deadline=None)
 @given(
-    n_contacts=st.integers(1, 40),
+    n_tools=st.integers(1, 40),
     tick=st.integers(0, 2**62),
     number=st.floats(allow_nan=False),
     integer=st.integers(-(2**63), 2**63 - 1),
 )
-def test_forces_carry_every_number_unchanged(n_contacts: int, tick: int, number: float, integer: int) -> None:
+def test_forces_carry_every_number_unchanged(n_tools: int, tick: int, number: float, integer: int) -> None:
     random = np.random.default_rng(tick % 1000)
-    inputs = random.integers(-1, 2**40, (n_contacts, 4))
-    motion = random.normal(size=(n_contacts, 8))
+    inputs = random.integers(-1, 2**40, (n_tools, 4))
+    motion = random.normal(size=(n_tools, 8))
     inputs[-1, 1], motion[-1, 4] = integer, number
-    payload = wire.ForceEncoder(n_contacts).encode(tick, 10, inputs, motion)
+    payload = wire.ForceEncoder(n_tools).encode(tick, 10, inputs, motion)
     assert msgpack.unpackb(payload) == {
+        "kind": "force",
         "tick": tick,
         "server_time_ns": 10,
         "sequence": inputs[:, 0].tolist(),
         "client_time_ns": inputs[:, 1].tolist(),
         "input_age_ns": inputs[:, 2].tolist(),
         "flags": inputs[:, 3].tolist(),
-        "displacement_m": motion[:, 0:3].tolist(),
+        "position_m": motion[:, 0:3].tolist(),
         "force_n": motion[:, 3:6].tolist(),
         "force_scale": motion[:, 6].tolist(),
         "energy_j": motion[:, 7].tolist(),
@@ -157,8 +300,11 @@ def test_forces_carry_every_number_unchanged(n_contacts: int, tick: int, number:
 
 def test_surface_displacements_are_little_endian_float32() -> None:
     displacement = np.array([1.5, -2.25, 0.0], np.float32)
-    message = msgpack.unpackb(wire.encode_surface(1, 2, displacement))
+    message = unpack(wire.encode_surface(1, 2, displacement), Kind.SURFACE)
     np.testing.assert_array_equal(np.frombuffer(message["displacement_m"], "<f4"), displacement)
+
+
+# The page
 
 
 def _table(heading: str, number: int = 0) -> list[list[str]]:
@@ -192,13 +338,13 @@ def test_the_page_lists_exactly_the_flags_of_the_code() -> None:
 
 def test_the_page_lists_exactly_the_reasons_of_the_code() -> None:
     assert _fields("Counters") == ["refused", "malformed", "dropped"]
-    assert set(_meaning("Counters", "malformed")) == set(wire.MALFORMED)
-    assert set(_meaning("Counters", "refused")) == set(wire.REFUSED)
-    assert set(_meaning("Counters", "dropped")) == set(wire.DROPPED)
+    assert set(_meaning("Counters", "malformed")) == set(MALFORMED)
+    assert set(_meaning("Counters", "refused")) == set(REFUSED)
+    assert set(_meaning("Counters", "dropped")) == set(DROPPED)
 
 
 def _calls(file: str) -> list[ast.Call]:
-    tree = ast.parse((Path(wire.__file__).parent / file).read_text())
+    tree = ast.parse((SERVER / file).read_text())
     return [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
 
 
@@ -210,50 +356,55 @@ def _named(node: ast.expr, name: str) -> bool:
     return isinstance(node, ast.Name) and node.id == name
 
 
+def _session_files() -> list[str]:
+    return [f"session/{path.name}" for path in (SERVER / "session").glob("*.py")] + ["recording/recorder.py"]
+
+
 def test_the_page_lists_exactly_the_reasons_for_which_a_query_is_refused() -> None:
-    raised: set[str] = set()
-    for file in ("session/requests.py", "session/leases.py", "recording/recorder.py", "session/state.py"):
-        raised |= _texts(call.args[0] for call in _calls(file) if _named(call.func, "Refused"))
-    raised |= _texts(call.args[1] for call in _calls("server.py") if _named(call.func, "_refuse"))
-    assert raised == set(wire.NOT_GRANTED)
-    assert set(_fields("Control", 1)) == raised | set(wire.MALFORMED)
+    calls = [call for file in _session_files() for call in _calls(file)]
+    raised = _texts(call.args[0] for call in calls if _named(call.func, "Refused"))
+    raised |= _texts(call.args[1] for call in calls if _named(call.func, "_refuse"))
+    assert raised == set(NOT_GRANTED)
+    assert set(_fields("Control", 1)) == raised | set(MALFORMED)
 
 
 def test_the_page_lists_exactly_the_fields_that_control_requests_have() -> None:
     read: set[str] = set()
-    for call in _calls("session/requests.py"):
+    for call in (call for file in ("session/fields.py", "session/requests.py") for call in _calls(file)):
         is_get = isinstance(call.func, ast.Attribute) and _named(call.func.value, "request")
         if is_get or (call.args and _named(call.args[0], "request")):
             read |= _texts(call.args)
-    assert read
-    written = [name for row in _table("Control") for name in _names(row[1])]
-    assert sorted(written) == sorted(read)
+    assert read > {"tools", "limits", "file"}
+    written = {name for row in _table("Control") for name in _names(row[1])}
+    assert written == read - {"schema_version"}  # which every request has
 
 
 @pytest.fixture
-def service(make_spring_mass_model: Callable[..., ReducedModel]) -> Service:
+def state(make_spring_mass_model: Callable[..., ReducedModel]) -> SessionState:
     limits = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
-    return Service(make_spring_mass_model(2, 4), limits, wire.Keys("test"), 1 / 30)
+    return SessionState(make_spring_mass_model(2, 4), limits, Keys("test"), 1 / 30)
 
 
-def test_the_page_lists_exactly_the_fields_of_a_status(service: Service) -> None:
-    status = service.status()
-    assert sorted(_fields("Status")) == sorted(status)
-    assert set(_meaning("Status", "model")) == status["model"].keys()
-    assert set(_meaning("Status", "compute_time_s")) == status["compute_time_s"].keys()
-    assert _fields("Status of a contact") == list(status["contacts"]["tip"])
+def test_the_page_lists_exactly_the_fields_of_a_status(state: SessionState) -> None:
+    message = status(state, 1)
+    assert sorted(_fields("Status")) == sorted(message)
+    assert set(_meaning("Status", "model")) == message["model"].keys()
+    assert set(_meaning("Status", "compute_time_s")) == message["compute_time_s"].keys()
+    assert _fields("Status of a tool") == list(message["tools"]["tip"])
 
 
-def test_the_page_lists_exactly_the_fields_of_a_recordings_report(tmp_path: Path, service: Service) -> None:
-    recorder = Recorder(tmp_path / "a.mcap", service.keys, service.describe(), service.memory)
+def test_the_page_lists_exactly_the_fields_of_a_recordings_report(
+    tmp_path: Path, state: SessionState
+) -> None:
+    recorder = Recorder(tmp_path / "a.mcap", state.keys, description(state), state.memory)
     recorder.stop()
     assert set(_meaning("Status", "recording")) - {"record"} == recorder.report().keys()
 
 
-def test_the_page_lists_exactly_the_fields_of_a_description(service: Service) -> None:
-    described = service.describe()
+def test_the_page_lists_exactly_the_fields_of_a_description(state: SessionState) -> None:
+    described = description(state)
     assert _fields("Describe") == list(described)
-    assert _meaning("Describe", "contacts") == list(described["contacts"][0])
+    assert _meaning("Describe", "tools") == list(described["tools"][0])
     assert _meaning("Describe", "limits") == list(described["limits"])
     assert _meaning("Describe", "devices") == list(next(iter(described["devices"].values())))
     assert set(_meaning("Describe", "model")) <= described["model"].keys()
@@ -270,16 +421,17 @@ def test_the_settings_on_the_page_are_a_configuration_for_a_client() -> None:
     config = zenoh.Config.from_json5(block)
     expected = {
         "mode": "client",
-        "connect/endpoints": [transport.DEFAULT_ENDPOINT],
+        "connect/endpoints": [DEFAULT_ENDPOINT],
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "transport/link/tx/lease": transport.LEASE_MS,
+        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/keep_alive": KEEP_ALIVES,
     }
     assert {key: json.loads(config.get_json(key)) for key in expected} == expected
 
 
 def test_the_page_lists_the_keys_of_the_code() -> None:
-    keys = wire.Keys("SESSION")
+    keys = Keys("SESSION")
     expected = {
         keys.server,
         keys.client("CLIENT"),
@@ -295,23 +447,23 @@ def test_the_page_lists_the_keys_of_the_code() -> None:
 
 
 def test_the_page_lists_exactly_the_fields_of_a_force() -> None:
-    message = msgpack.unpackb(wire.ForceEncoder(1).encode(0, 0, np.zeros((1, 4), np.int64), np.zeros((1, 8))))
+    message = msgpack.unpackb(wire.ForceEncoder(1).encode(0, 0, *no_ticks(1)))
     assert [row[0].strip("`") for row in _table("Force")] == list(message)
 
 
 def test_the_page_lists_exactly_the_fields_of_a_command() -> None:
     fields = [row[0].strip("`") for row in _table("Command")]
-    assert fields == list(wire.Command._fields)
+    assert fields == ["kind", *wire.Command._fields]
 
 
 def test_the_page_lists_exactly_the_control_actions_of_the_code() -> None:
-    assert [row[0].strip("`") for row in _table("Control")] == list(wire.ACTIONS)
+    assert [row[0].strip("`") for row in _table("Control")] == list(ACTIONS)
 
 
 def test_the_page_names_the_schema_version_the_encoding_and_the_size_limit() -> None:
     text = PAGE.read_text()
-    assert f"schema version {wire.SCHEMA_VERSION}" in text
-    assert wire.ENCODING in text
-    assert f"{wire.MAX_COMMAND_BYTES} bytes" in text
-    assert f"{wire.MAX_REQUEST_BYTES} bytes" in text
-    assert f"{transport.MAX_MESSAGE_BYTES} bytes" in text
+    assert f"schema version {SCHEMA_VERSION}" in text
+    assert ENCODING in text
+    assert f"{MAX_COMMAND_BYTES} bytes" in text
+    assert f"{MAX_REQUEST_BYTES} bytes" in text
+    assert f"{MAX_MESSAGE_BYTES} bytes" in text

@@ -6,15 +6,14 @@ python -m palpate_server.diagnostics.metrics [--connect ENDPOINT] [--session NAM
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgpack
-
-from palpate_server import wire
+from palpate_client import wire
 from palpate_server.arguments import need, port
 from palpate_server.session import transport
 
@@ -75,10 +74,10 @@ class StatusCollector(Collector):
                     gauge.add_metric([quantile], value)
             yield gauge
         for name, text in _RATES.items():
-            rate = GaugeMetricFamily(f"palpate_{name}", text, labels=["contact"])
-            for contact, state in status["contacts"].items():
+            rate = GaugeMetricFamily(f"palpate_{name}", text, labels=["tool"])
+            for tool, state in status["tools"].items():
                 if state[name] is not None:
-                    rate.add_metric([contact], state[name])
+                    rate.add_metric([tool], state[name])
             yield rate
 
 
@@ -101,8 +100,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             heard = threading.Event()
 
             def on_status(sample: Any) -> None:
-                collector.status = msgpack.unpackb(sample.payload.to_bytes())
-                heard.set()
+                with contextlib.suppress(wire.MalformedMessage):
+                    collector.status = wire.unpack(sample.payload.to_bytes(), wire.Kind.STATUS)
+                    heard.set()
 
             session.declare_subscriber(keys.status, on_status)  # for as long as the session
             REGISTRY.register(collector)

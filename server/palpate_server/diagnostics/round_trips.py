@@ -18,7 +18,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from palpate_server import wire
+from palpate_client import wire
 from palpate_server.session import transport
 
 RATE_HZ = 1000
@@ -147,14 +147,14 @@ def pong(endpoint: str, size: int) -> None:
 
 
 def through_a_model(
-    path: Path, contact: str, seconds: float, *, viewer: bool
+    path: Path, tool: str, seconds: float, *, viewer: bool
 ) -> tuple[RoundTrips, dict[str, Any]]:
-    """Against a server of its own for the model in `path`, driven at one contact; and that server's last status.
+    """Against a server of its own for the model in `path`, driven at one tool; and that server's last status.
 
     With `viewer` the surface is listened to as well, 60 times a second and by the same process: more work for both.
     """
     statuses: list[dict[str, Any]] = []
-    with _served(path, contact) as (session, keys):
+    with _served(path, tool) as (session, keys):
         if viewer:
             session.declare_subscriber(keys.surface, lambda sample: None)
         session.declare_subscriber(
@@ -164,15 +164,15 @@ def through_a_model(
             session,
             keys.command(_CLIENT),
             keys.force,
-            lambda sequence, now: encode_command(contact, sequence, now),
+            lambda sequence, now: encode_command(tool, sequence, now),
             lambda payload: int(msgpack.unpackb(payload)["sequence"][0]),
             seconds,
         )
         return trips, statuses[-1]
 
 
-def trace_through_a_model(path: Path, contact: str, seconds: float) -> tuple[RoundTrips, Trace]:
-    """The same without a viewer, at the model's first contact, and all that a device would have lived through meanwhile."""
+def trace_through_a_model(path: Path, tool: str, seconds: float) -> tuple[RoundTrips, Trace]:
+    """The same without a viewer, at the model's first tool, and all that a device would have lived through meanwhile."""
     heard: list[Heard] = []
 
     def hear(arrival_ns: int, payload: bytes) -> None:
@@ -180,12 +180,12 @@ def trace_through_a_model(path: Path, contact: str, seconds: float) -> tuple[Rou
         sequence, age_ns = force["sequence"][0], force["input_age_ns"][0]
         heard.append(Heard(arrival_ns, force["tick"], force["server_time_ns"], sequence, age_ns))
 
-    with _served(path, contact) as (session, keys):
+    with _served(path, tool) as (session, keys):
         sent = _drive(
             session,
             keys.command(_CLIENT),
             keys.force,
-            lambda sequence, now: encode_command(contact, sequence, now),
+            lambda sequence, now: encode_command(tool, sequence, now),
             hear,
             seconds,
         )
@@ -195,29 +195,29 @@ def trace_through_a_model(path: Path, contact: str, seconds: float) -> tuple[Rou
 
 
 @contextlib.contextmanager
-def _served(path: Path, contact: str) -> Iterator[tuple[zenoh.Session, wire.Keys]]:
-    """A session with a server of its own for the model in `path`, one contact of which it holds."""
+def _served(path: Path, tool: str) -> Iterator[tuple[zenoh.Session, wire.Keys]]:
+    """A session with a server of its own for the model in `path`, one tool of which it holds."""
     endpoint = free_endpoint()
     command = [sys.executable, "-m", "palpate_server", str(path), "--listen", endpoint, "--surface-hz", "60"]
     keys = wire.Keys("main")
     with (
         running(command, "serving"),
         transport.connect_session(endpoint, None) as session,
-        holding(session, keys, contact),
+        holding(session, keys, tool),
     ):
         yield session, keys
 
 
 @contextlib.contextmanager
-def holding(session: zenoh.Session, keys: wire.Keys, contact: str) -> Iterator[None]:
-    """Hold a contact as the client of this module."""
+def holding(session: zenoh.Session, keys: wire.Keys, tool: str) -> Iterator[None]:
+    """Hold a tool as the client of this module."""
     token = session.liveliness().declare_token(keys.client(_CLIENT))
-    request = wire.pack({"contacts": [contact]})
+    request = wire.pack({"kind": wire.Kind.REQUEST, "schema_version": wire.SCHEMA_VERSION, "tools": [tool]})
     give_up = time.monotonic() + _START_S
     acquire = keys.control(_CLIENT, "acquire")
     while not any(reply.ok for reply in session.get(acquire, payload=request, timeout=2.0)):
         if time.monotonic() > give_up:
-            raise transport.TransportError(f"contact {contact} could not be acquired")
+            raise transport.TransportError(f"tool {tool} could not be acquired")
         time.sleep(0.05)
     try:
         yield
@@ -225,11 +225,12 @@ def holding(session: zenoh.Session, keys: wire.Keys, contact: str) -> Iterator[N
         token.undeclare()  # type: ignore[no-untyped-call]
 
 
-def encode_command(contact: str, sequence: int, now_ns: int) -> bytes:
+def encode_command(tool: str, sequence: int, now_ns: int) -> bytes:
     command = {
+        "kind": wire.Kind.COMMAND,
         "sequence": sequence,
         "client_time_ns": now_ns,
-        "displacement_m": {contact: [0.001, 0.002, -0.003]},
+        "position_m": {tool: [0.001, 0.002, -0.003]},
     }
     return wire.pack(command)
 

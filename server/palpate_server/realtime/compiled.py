@@ -13,6 +13,10 @@ from typing import Any, TypeVar, cast
 from numba import njit
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
+from palpate_client import wire as client_wire
+
+_COMPILED_ROOMS = ("bodies", "coupling", "realtime")
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -31,7 +35,7 @@ def compiled_without_gil(function: Function) -> Function:
 
 
 class _Cache(FunctionCache):
-    """numba's cache on disk, under names that change as soon as any file of the server does.
+    """numba's cache on disk, under names that change as soon as any file with compiled functions does.
 
     numba looks at the function's own file alone, though what it stores has the functions of other files in it. And it
     reads what is out of date before it finds that out, which fails where a type has moved: so not the stamp, the name.
@@ -46,12 +50,13 @@ class _Cache(FunctionCache):
 
 @cache
 def _package_digest() -> str:
-    """The hash of all names and contents of the server's source files."""
+    """The hash of all names and contents of the source files that compiled functions are made from."""
     digest = hashlib.sha256()
     folder = Path(__file__).parents[1]
-    for path in sorted(folder.rglob("*.py")):
+    paths = [path for room in _COMPILED_ROOMS for path in folder.joinpath(room).glob("*.py")]
+    for path in [*sorted(paths), folder / "wire.py", Path(client_wire.__file__)]:
         source = path.read_bytes()
-        digest.update(f"{path.relative_to(folder)} {len(source)}\n".encode() + source)
+        digest.update(f"{path.name} {len(source)}\n".encode() + source)
     return digest.hexdigest()
 
 

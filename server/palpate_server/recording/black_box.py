@@ -112,7 +112,7 @@ class BlackBox:
             buffer = io.BytesIO()
             np.savez(
                 buffer,
-                contacts=np.array(self.contacts),
+                tools=np.array(self.contacts),
                 tick=ticks,
                 server_time_ns=times[:, shared_memory.START_NS],
                 deadline_ns=times[:, shared_memory.TICK_DEADLINE_NS],
@@ -121,7 +121,7 @@ class BlackBox:
                 client_time_ns=inputs[:, :, shared_memory.CLIENT_TIME_NS],
                 input_age_ns=inputs[:, :, shared_memory.AGE_NS],
                 flags=inputs[:, :, shared_memory.CONTACT_FLAGS],
-                displacement_m=motion[:, :, 0:3],
+                position_m=motion[:, :, 0:3],
                 force_n=motion[:, :, 3:6],
                 force_scale=motion[:, :, shared_memory.SCALE],
                 energy_j=motion[:, :, shared_memory.ENERGY_J],

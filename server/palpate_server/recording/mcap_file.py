@@ -27,12 +27,12 @@ _NUMBERS = {"type": "array", "items": {"type": "number"}}
 _POINT = {"type": "object", "properties": {axis: {"type": "number"} for axis in "xyz"}}
 _POINTS = {"type": "array", "items": _POINT}
 _MAP: dict[str, Any] = {"type": "object", "properties": {}}
-_VECTORS_OF_A_FORCE = ("displacement_m", "force_n")
+_VECTORS_OF_A_FORCE = ("position_m", "force_n")
 _SCHEMAS: dict[str, dict[str, Any]] = {
     "command": {
         "sequence": {"type": "integer"},
         "client_time_ns": {"type": "integer"},
-        "displacement_m": _MAP,
+        "position_m": _MAP,
         "velocity_m_per_s": _MAP,
         "rendered_tick": {"type": "integer"},
     },
@@ -43,7 +43,7 @@ _SCHEMAS: dict[str, dict[str, Any]] = {
         "client_time_ns": _NUMBERS,
         "input_age_ns": _NUMBERS,
         "flags": _NUMBERS,
-        "displacement_m": _POINTS,
+        "position_m": _POINTS,
         "force_n": _POINTS,
         "force_scale": _NUMBERS,
         "energy_j": _NUMBERS,

@@ -24,10 +24,11 @@ from pathlib import Path
 
 import zenoh
 
-from palpate_server import wire
+from palpate_client import wire
 from palpate_server.arguments import need, positive
 from palpate_server.realtime.safety import Flags
 from palpate_server.session import transport
+from palpate_server.wire import MAX_RECORDED_BYTES
 
 if __name__ == "__main__":
     need("mcap", "recorder", "palpate record")
@@ -56,7 +57,7 @@ class Hearing:
 
 def _uses_a_new_command(payload: bytes) -> bool:
     try:
-        force = wire.unpack_map(payload, wire.MAX_RECORDED_BYTES)
+        force = wire.unpack_map(payload, MAX_RECORDED_BYTES)
         used = zip(force["sequence"], force["flags"], strict=True)
         return any(sequence >= 0 and not flags & Flags.HELD for sequence, flags in used)
     except (wire.MalformedMessage, KeyError, TypeError, ValueError):
@@ -92,7 +93,7 @@ def record(
 
     def write(item: tuple[str, str, int, bytes]) -> None:
         kind, *_, payload = item
-        if len(payload) <= wire.MAX_RECORDED_BYTES:
+        if len(payload) <= MAX_RECORDED_BYTES:
             recording.add(*item)
         if hearing.misses_commands(kind, payload):
             on_no_commands()

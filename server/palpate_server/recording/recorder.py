@@ -22,9 +22,10 @@ import msgpack
 import numpy as np
 
 from palpate.files import LONGEST_NAME_BYTES, is_plain_name
-from palpate_server import wire
+from palpate_client import wire
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.session.leases import Refused
+from palpate_server.wire import ForceEncoder
 
 log = logging.getLogger("palpate_server")
 
@@ -64,7 +65,7 @@ class Recorder:
         self.error: str | None = None
         self._keys = keys
         self._memory = memory  # its ring stays the same when the model is exchanged
-        self._encoder = wire.ForceEncoder(len(memory.scale))
+        self._encoder = ForceEncoder(len(memory.scale))
         self._next_tick = int(scheduler.records_written(memory.shared))
         self._heard: queue.SimpleQueue[tuple[int, str, str, bytes]] = queue.SimpleQueue()
         self._waiting: list[tuple[int, str, str, bytes]] = []

@@ -34,12 +34,14 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 
 from palpate.model_file import ModelFileError, ReducedModel, load_model
+from palpate_client.wire import MalformedMessage, last_chunk
 from palpate_server import wire
 from palpate_server.realtime import safety, scheduler, shared_memory
-from palpate_server.realtime.frames import Frame, read_frame
+from palpate_server.realtime.frames import Frame
 from palpate_server.realtime.native_image import Image, make_image
 from palpate_server.realtime.safety import Flags, Limits
 from palpate_server.recording.mcap_file import from_json
+from palpate_server.session.admission import out_of_range
 
 _MAGIC = b"\x89MCAP0\r\n"  # an MCAP file begins with it
 _OF_THE_TICK = int(Flags.LATE | Flags.CAUGHT_UP)  # depend on the machine, not on the model
@@ -121,7 +123,7 @@ def read_session(path: Path) -> Session:
                         )
                     session.statuses.append(message)
                 elif kind == "command":
-                    _add_command(session, wire.last_chunk(key), message)
+                    _add_command(session, last_chunk(key), message)
     except OSError as error:
         raise ReplayError(f"{path}: {error.strerror}") from error
     except McapError as error:
@@ -153,9 +155,9 @@ def _messages(reader: NonSeekingReader) -> Iterator[tuple[str, str, dict[str, An
 def _add_command(session: Session, client: str, message: dict[str, Any]) -> None:
     try:
         command = wire.read_command(message)
-    except wire.MalformedMessage:
+    except MalformedMessage:
         return  # the server refused it too
-    if wire.is_in_range(command):
+    if out_of_range(command) is None:
         key = client, command.sequence, command.client_time_ns
         after_tick = session.forces[-1]["tick"] if session.forces else -1
         session.commands.setdefault(key, []).append(Heard(command, after_tick))
@@ -163,7 +165,7 @@ def _add_command(session: Session, client: str, message: dict[str, Any]) -> None
 
 def compare(session: Session, model: ReducedModel) -> Comparison:
     """Repeat every tick that follows a known rest without a break. Raises ReplayError."""
-    names = [contact["name"] for contact in session.description["contacts"]]
+    names = [contact["name"] for contact in session.description["tools"]]
     models = [session.description["model"], *(status["model"] for status in session.statuses)]
     if names != [contact.name for contact in model.contacts] or not any(_is(m, model) for m in models):
         raise ReplayError(
@@ -243,7 +245,7 @@ def _known_rest(session: Session, model: ReducedModel) -> NDArray[np.bool_]:
         since = status["at_rest_since_tick"]
         if since < 0 or not _is(status["model"], model):
             continue
-        since = max(since, *(state["since_tick"] for state in status["contacts"].values()))
+        since = max(since, *(state["since_tick"] for state in status["tools"].values()))
         known |= (since <= ticks) & (ticks < status["ticks"])
     return known
 
@@ -263,7 +265,7 @@ def _untold(session: Session) -> Set[int]:
     ticks: set[int] = set()
     for before, after in itertools.pairwise(session.statuses):
         if after["number"] != before["number"] + 1:
-            contacts = after["contacts"].values()
+            contacts = after["tools"].values()
             last = max(after["undisturbed_since_tick"], *(state["since_tick"] for state in contacts))
             # What is agreed is told a little later than it holds.
             ticks.update(range(before["ticks"] - _OUT_OF_ORDER_TICKS, last))
@@ -277,9 +279,9 @@ class _Terms:
         self._limits: list[dict[int, Limits]] = [{} for _ in names]
         self._frames: list[dict[int, Frame]] = [{} for _ in names]
         for status in session.statuses:
-            for contact, state in enumerate(status["contacts"][name] for name in names):
+            for contact, state in enumerate(status["tools"][name] for name in names):
                 self._limits[contact][state["since_tick"]] = Limits(**state["limits"])
-                self._frames[contact][state["held_since_tick"]] = read_frame(state["frame"])
+                self._frames[contact][state["held_since_tick"]] = _frame(state)
 
     def agree(self, image: Image, tick: int) -> None:
         """What changes before this tick."""
@@ -290,6 +292,11 @@ class _Terms:
         """What holds at this tick, which everything begins at rest."""
         for contact, (limits, frames) in enumerate(zip(self._limits, self._frames, strict=True)):
             _agree(image, contact, _latest(limits, tick), _latest(frames, tick))
+
+
+def _frame(state: dict[str, Any]) -> Frame:
+    frame = state["frame"]
+    return Frame(tuple(map(tuple, frame["rotation"])), frame["scale"], tuple(state["home_m"]))
 
 
 def _latest(since: dict[int, Agreed], tick: int) -> Agreed | None:
@@ -318,9 +325,7 @@ class _UsedCommands:
         self._names = names
         self._holders: list[dict[int, set[str]]] = [{} for _ in names]  # by the first tick of their hold
         for status in session.statuses:
-            for holders, state in zip(
-                self._holders, (status["contacts"][name] for name in names), strict=True
-            ):
+            for holders, state in zip(self._holders, (status["tools"][name] for name in names), strict=True):
                 told = holders.setdefault(state["held_since_tick"], set())
                 if state["holder"] is not None:
                     told.add(state["holder"])
@@ -349,7 +354,7 @@ class _UsedCommands:
         heard = [
             (after_tick, command)
             for command, after_tick in self._session.commands.get(key, ())
-            if self._names[contact] in command.displacement_m
+            if self._names[contact] in command.position_m
             and abs(max(after_tick, begin) - tick) <= _OUT_OF_ORDER_TICKS
         ]
         if not heard:
@@ -359,7 +364,7 @@ class _UsedCommands:
             return first
         # Refused, if it was before the hold or for another contact's sake.
         in_hold = after_tick >= held_since + _OUT_OF_ORDER_TICKS
-        alike = all(command.displacement_m.keys() == first.displacement_m.keys() for _, command in heard)
+        alike = all(command.position_m.keys() == first.position_m.keys() for _, command in heard)
         return first if in_hold and alike else None
 
 
@@ -389,7 +394,7 @@ def _hand_over(
         scheduler.forget_command(memory.commands, contact)
         return
     if command is None:
-        applied = tuple(message["displacement_m"][contact])
+        applied = tuple(message["position_m"][contact])
         command = wire.Command(sequence, client_time_ns, {name: applied}, {name: wire.STILL})
     scheduler.write_command(
         memory.commands,
@@ -399,7 +404,7 @@ def _hand_over(
         message["server_time_ns"] - message["input_age_ns"][contact],
         command.rendered_tick,
         int(memory.commands.lease[contact]),
-        command.displacement_m[name],
+        command.position_m[name],
         command.velocity_m_per_s[name],
     )
 
@@ -408,7 +413,7 @@ def _difference(message: dict[str, Any], memory: shared_memory.Memory, row: int)
     motion = memory.record_motion[row]
     flags = memory.record_inputs[row, :, shared_memory.CONTACT_FLAGS] & ~_OF_THE_TICK
     for name, recorded, repeated in (
-        ("displacement_m", message["displacement_m"], motion[:, 0:3].tolist()),
+        ("position_m", message["position_m"], motion[:, 0:3].tolist()),
         ("force_n", message["force_n"], motion[:, 3:6].tolist()),
         ("force_scale", message["force_scale"], motion[:, shared_memory.SCALE].tolist()),
         ("flags", [f & ~_OF_THE_TICK for f in message["flags"]], flags.tolist()),

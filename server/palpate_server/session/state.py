@@ -1,110 +1,109 @@
-"""What is being served: the model that runs, the memory of its ticks, who holds its contacts; shared by all threads."""
+"""The state of a session that its threads share: model, loop, leases, counters."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import asdict
 from typing import Any
 
 from palpate.model_file import ReducedModel
-from palpate_server import wire
-from palpate_server.realtime import safety, scheduler, shared_memory
+from palpate_client.wire import MALFORMED, REFUSED, Keys
+from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
-from palpate_server.realtime.safety import Flags, Limits
+from palpate_server.realtime.safety import Limits
 from palpate_server.recording.recorder import Recorder
-from palpate_server.session import status
-from palpate_server.session.devices import PROFILES
-from palpate_server.session.leases import Leases, Refused
+from palpate_server.session.frame import IDENTITY
+from palpate_server.session.leases import Leases, Refused, ToolSettings
 
-STATUS_PERIOD_S = 0.1
-_CHANGE_TIMEOUT_S = 1.0
+CHANGE_TIMEOUT_S = 1.0
 
 
-class Service:
-    """One model in one session. `limits` are what no client can exceed.
+class MessageCounters:
+    """How many commands were accepted, refused and malformed, by reason; written by the receiving thread.
 
-    state                   "running" or "stopping"; `stopping` is set when all threads are to end
-    last_sequence           of each contact, the number of the lease that its newest command came under, and its sequence
-    undisturbed_since_tick  the last reset or change of model: until then a recording can be repeated
-    lost_clients            clients whose token went while they held a contact
+    accepted_of counts by tool: a command can move several.
+    """
+
+    def __init__(self, n_tools: int) -> None:
+        self.accepted = 0
+        self.accepted_of = [0] * n_tools
+        self.refused: Counter[str] = Counter(dict.fromkeys(REFUSED, 0))
+        self.malformed: Counter[str] = Counter(dict.fromkeys(MALFORMED, 0))
+        self.unsent_forces = 0
+
+
+class SessionState:
+    """One model in one session.
+
+    limits                  what no client can exceed
+    tools                   their names, in the model's order
+    tool_index              of a tool's name
+    running                 False once the server stops: commands and requests are then refused
+    stopping                set when all threads are to end
+    undisturbed_since_tick  of the last reset or change of model
+    lost_clients            clients whose token went while they held a tool
+    exchanging              held while a model is loaded or a tool acquired: the one would disturb the other
     model_in_use            held while the surface is computed from the model, and while it is exchanged
     """
 
-    def __init__(self, model: ReducedModel, limits: Limits, keys: wire.Keys, surface_period_s: float) -> None:
+    def __init__(self, model: ReducedModel, limits: Limits, keys: Keys, surface_period_s: float) -> None:
         self.model = model
         self.limits = limits
         self.keys = keys
         self.surface_period_s = surface_period_s
-        self.names = [contact.name for contact in model.contacts]
-        self.contact_index = {name: i for i, name in enumerate(self.names)}
-        self.leases = Leases(self.names, limits)
-        self.messages = status.MessageCounters(len(self.names))
-        self.last_sequence = [(0, -1)] * len(self.names)
+        self.tools = tuple(contact.name for contact in model.contacts)
+        self.tool_index = {name: i for i, name in enumerate(self.tools)}
         self.memory = shared_memory.make_memory(
-            model.discrete, model.period_s, [limits] * len(self.names), surface_period_s
+            model.discrete, model.period_s, [limits] * len(self.tools), surface_period_s
         )
+        homes = [contact.center_m for contact in model.contacts]
+        for positions in (self.memory.origin, self.memory.target, self.memory.position):
+            positions[:] = homes
+        for positions in (self.memory.device, self.memory.applied):
+            positions[:] = homes
         self.image = make_image(self.memory)
-        self.state = "running"
+        self.leases = Leases(
+            {name: ToolSettings(limits, IDENTITY, home) for name, home in zip(self.tools, homes, strict=True)}
+        )
+        self.messages = MessageCounters(len(self.tools))
+        self.running = True
         self.stopping = threading.Event()
         self.undisturbed_since_tick = 0
         self.lost_clients = 0
-        self._statuses = 0
         self.recorder: Recorder | None = None
+        self.exchanging = threading.Lock()
         self.model_in_use = threading.Lock()
         self._changing = threading.Lock()  # the loop has one slot for changes
 
-    def forget_commands(self, contacts: Iterable[str]) -> None:
-        """Let the forces of contacts fade from the next tick on."""
-        for name in contacts:
-            scheduler.forget_command(self.memory.commands, self.contact_index[name])
+    def check_running(self) -> None:
+        """Raises Refused once the server stops."""
+        if not self.running:
+            raise Refused("stopping", "the server is stopping")
+
+    def check_alone(self, client: str) -> None:
+        """Raises Refused unless a client holds a tool and no other does: what it asks for would be felt by all."""
+        for name, holder in self.leases.holders.items():
+            if holder not in (None, client):
+                raise Refused("held", f"tool {name!r} is held by client {holder!r}, who would feel it")
+        if not self.leases.held_by(client):
+            raise Refused("not_holder", f"client {client!r} holds no tool")
+
+    def forget_commands(self, tools: Iterable[str]) -> None:
+        """Let the forces of tools fade from the next tick on."""
+        for name in tools:
+            scheduler.forget_command(self.memory.commands, self.tool_index[name])
 
     def between_ticks(self, ask: Callable[..., None], *what: Any) -> int:
         """Have the loop change something; the first tick after it. Raises Refused when no tick comes: nothing is changed."""
         with self._changing:
             if self.stopping.is_set():
                 raise Refused("stopping", "the server is stopping")
-            give_up = time.monotonic() + _CHANGE_TIMEOUT_S
+            give_up = time.monotonic() + CHANGE_TIMEOUT_S
             ask(self.image, *what)
             while (tick := scheduler.changed_at(self.image)) < 0:
                 if time.monotonic() > give_up and scheduler.withdraw_change(self.image):
                     raise Refused("busy", "no tick came that could have made the change")
                 time.sleep(self.model.period_s / 4)
             return tick
-
-    def status(self) -> dict[str, Any]:
-        """The next status message; one thread at a time may call this."""
-        self._statuses += 1
-        return status.status(
-            self._statuses,
-            self.state,
-            time.monotonic_ns(),
-            self.model,
-            self.memory,
-            self.messages,
-            self.leases,
-            self.undisturbed_since_tick,
-            self.lost_clients,
-            None if self.recorder is None else self.recorder.report(),
-        )
-
-    def describe(self) -> dict[str, Any]:
-        """The describe reply: what a client must know before it moves anything."""
-        summary = self.model.summary()
-        summary["accuracy"].pop("hankel_singular_values")
-        return {
-            "schema_version": wire.SCHEMA_VERSION,
-            "session": self.keys.session,
-            "period_s": self.model.period_s,
-            "contacts": [asdict(contact) for contact in self.model.contacts],
-            "limits": self.limits._asdict(),
-            "devices": {name: asdict(profile) for name, profile in PROFILES.items()},
-            "hold_s": safety.HOLD_NS * 1e-9,
-            "decay_s": safety.DECAY_NS * 1e-9,
-            "soft_start_s": safety.SOFT_START_NS * 1e-9,
-            "status_period_s": STATUS_PERIOD_S,
-            "surface_period_s": self.surface_period_s,
-            "flags": {flag.name: flag.value for flag in Flags},
-            "model": summary,
-        }

@@ -1,36 +1,36 @@
-"""What the loop and the wire have been doing, as plain numbers: the status message."""
+"""What the server says of itself, as plain maps: the status message and the describe reply."""
 
 from __future__ import annotations
 
-from collections import Counter
+import time
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.model_file import ReducedModel
-from palpate_server.realtime import scheduler, shared_memory
-from palpate_server.realtime.safety import Flags
-from palpate_server.session.leases import Leases
-from palpate_server.wire import DROPPED, MALFORMED, REFUSED
+from palpate_client.wire import DROPPED, SCHEMA_VERSION, Flags, Kind
+from palpate_server.realtime import safety, scheduler, shared_memory
+from palpate_server.session.devices import PROFILES
+from palpate_server.session.state import MessageCounters, SessionState
 
+STATUS_PERIOD_S = 0.1
 ROLLING_TICKS = 100
 _BIN_S = 1e-6
-
-
-class MessageCounters:
-    """How many commands were accepted, refused and malformed, by reason; each written by the receiving thread.
-
-    accepted_of counts by contact: a command can move several.
-    """
-
-    def __init__(self, n_contacts: int) -> None:
-        self.accepted = 0
-        self.accepted_of = [0] * n_contacts
-        self.refused: Counter[str] = Counter(dict.fromkeys(REFUSED, 0))
-        self.malformed: Counter[str] = Counter(dict.fromkeys(MALFORMED, 0))
-        self.unsent_forces = 0
+_TICK_COUNTERS = {
+    "ticks": shared_memory.TICKS,
+    "ticks_on_arrival": shared_memory.TICKS_ON_ARRIVAL,
+    "late_ticks": shared_memory.LATE_TICKS,
+    "caught_up_ticks": shared_memory.CAUGHT_UP_TICKS,
+    "skipped_ticks": shared_memory.SKIPPED_TICKS,
+    "faults": shared_memory.FAULTS,
+}
+_DURATIONS = {
+    "timer_lateness_s": shared_memory.TIMER_LATENESS,
+    "tick_lateness_s": shared_memory.TICK_LATENESS,
+    "compute_time_s": shared_memory.COMPUTE_TIME,
+    "input_age_s": shared_memory.INPUT_AGE,
+}
 
 
 def percentiles(counts: NDArray[np.int64], longest_ns: int) -> dict[str, float | None]:
@@ -51,13 +51,13 @@ def percentiles(counts: NDArray[np.int64], longest_ns: int) -> dict[str, float |
     return {"p50": at(0.5), "p99": at(0.99), "p99_9": at(0.999), "max": longest_s}
 
 
-def recent_success_rate(memory: shared_memory.Memory, contact: int) -> float:
-    """Share of the last 100 ticks in which a new command of the contact's client had come in time."""
+def recent_success_rate(memory: shared_memory.Memory, tool: int) -> float:
+    """Share of the last 100 ticks in which a new command of the tool's client had come in time."""
     head = int(scheduler.records_written(memory.shared))
     if head == 0:
         return 0.0
     ticks = np.arange(max(0, head - ROLLING_TICKS), head) % shared_memory.RECORDS
-    flags = memory.record_inputs[ticks, contact, shared_memory.CONTACT_FLAGS]
+    flags = memory.record_inputs[ticks, tool, shared_memory.CONTACT_FLAGS]
     late = Flags.HELD | Flags.DECAYING | Flags.STALE
     return float(np.mean(flags & int(late) == 0))
 
@@ -72,65 +72,79 @@ def dropped(memory: shared_memory.Memory, messages: MessageCounters) -> dict[str
     return dict(zip(DROPPED, (max(0, superseded), messages.unsent_forces), strict=True))
 
 
-def success_rate(memory: shared_memory.Memory, contact: int) -> float | None:
+def success_rate(memory: shared_memory.Memory, tool: int) -> float | None:
     """Share of the ticks since the start in which a new command had come in time, of those with a client; None without."""
-    commanded, fresh = memory.tallies[contact].tolist()
+    commanded, fresh = memory.tallies[tool].tolist()
     return fresh / commanded if commanded else None
 
 
-def status(
-    number: int,
-    state: str,
-    server_time_ns: int,
-    model: ReducedModel,
-    memory: shared_memory.Memory,
-    messages: MessageCounters,
-    leases: Leases,
-    undisturbed_since_tick: int,
-    lost_clients: int,
-    recording: dict[str, Any] | None,
-) -> dict[str, Any]:
-    """The status message, the so many-th; `state` is "running" or "stopping", `recording` what its recorder reports."""
+def status(state: SessionState, number: int) -> dict[str, Any]:
+    """The status message; `number` counts them."""
+    memory, messages, model = state.memory, state.messages, state.model
     ticks = memory.counters.tolist()
-    durations = {
-        "timer_lateness_s": shared_memory.TIMER_LATENESS,
-        "tick_lateness_s": shared_memory.TICK_LATENESS,
-        "compute_time_s": shared_memory.COMPUTE_TIME,
-        "input_age_s": shared_memory.INPUT_AGE,
-    }
     return {
+        "kind": Kind.STATUS,
         "number": number,
-        "state": state,
-        "server_time_ns": server_time_ns,
+        "state": "running" if state.running else "stopping",
+        "server_time_ns": time.monotonic_ns(),
         "model": {"name": model.name, "order": model.order, "config_sha256": model.config_sha256},
-        "undisturbed_since_tick": undisturbed_since_tick,
+        "undisturbed_since_tick": state.undisturbed_since_tick,
         "at_rest_since_tick": ticks[shared_memory.AT_REST_SINCE],
-        "ticks": ticks[shared_memory.TICKS],
-        "ticks_on_arrival": ticks[shared_memory.TICKS_ON_ARRIVAL],
-        "late_ticks": ticks[shared_memory.LATE_TICKS],
-        "caught_up_ticks": ticks[shared_memory.CAUGHT_UP_TICKS],
-        "skipped_ticks": ticks[shared_memory.SKIPPED_TICKS],
-        "faults": ticks[shared_memory.FAULTS],
-        "lost_clients": lost_clients,
+        **{name: ticks[column] for name, column in _TICK_COUNTERS.items()},
+        "lost_clients": state.lost_clients,
         **{
             name: percentiles(memory.histograms[row].copy(), int(memory.longest_ns[row]))
-            for name, row in durations.items()
+            for name, row in _DURATIONS.items()
         },
         "accepted": messages.accepted,
         "refused": dict(messages.refused),
         "malformed": dict(messages.malformed),
         "dropped": dropped(memory, messages),
-        "recording": recording,
-        "contacts": {
-            name: {
-                "holder": holder,
-                "success_rate": recent_success_rate(memory, index),
-                "success_rate_since_start": success_rate(memory, index),
-                "limits": leases.terms[name].limits._asdict(),
-                "frame": asdict(leases.terms[name].frame),
-                "since_tick": leases.terms[name].since_tick,
-                "held_since_tick": leases.terms[name].held_since_tick,
+        "recording": None if state.recorder is None else state.recorder.report(),
+        "tools": {name: _tool_status(state, name) for name in state.tools},
+    }
+
+
+def _tool_status(state: SessionState, name: str) -> dict[str, Any]:
+    settings, index = state.leases.settings[name], state.tool_index[name]
+    return {
+        "holder": state.leases.holders[name],
+        "success_rate": recent_success_rate(state.memory, index),
+        "success_rate_since_start": success_rate(state.memory, index),
+        "limits": settings.limits._asdict(),
+        "frame": asdict(settings.frame),
+        "home_m": settings.home_m,
+        "since_tick": settings.since_tick,
+        "held_since_tick": settings.held_since_tick,
+    }
+
+
+def description(state: SessionState) -> dict[str, Any]:
+    """The describe reply: what a client must know before it moves anything."""
+    summary = state.model.summary()
+    summary["accuracy"].pop("hankel_singular_values")
+    return {
+        "kind": Kind.DESCRIBE,
+        "schema_version": SCHEMA_VERSION,
+        "session": state.keys.session,
+        "period_s": state.model.period_s,
+        "tools": [
+            {
+                "name": contact.name,
+                "start_m": contact.center_m,
+                "normal": contact.normal,
+                "radius_m": contact.radius_m,
+                "n_nodes": contact.n_nodes,
             }
-            for index, (name, holder) in enumerate(leases.holders.items())
-        },
+            for contact in state.model.contacts
+        ],
+        "limits": state.limits._asdict(),
+        "devices": {name: asdict(profile) for name, profile in PROFILES.items()},
+        "hold_s": safety.HOLD_NS * 1e-9,
+        "decay_s": safety.DECAY_NS * 1e-9,
+        "soft_start_s": safety.SOFT_START_NS * 1e-9,
+        "status_period_s": STATUS_PERIOD_S,
+        "surface_period_s": state.surface_period_s,
+        "flags": {flag.name: flag.value for flag in Flags},
+        "model": {"kind": "patch"} | summary,
     }

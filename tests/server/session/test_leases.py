@@ -1,17 +1,22 @@
-"""Leases: one holder a contact, and nothing half granted."""
+"""Leases: one holder a tool, and nothing half granted."""
 
 from __future__ import annotations
 
 import pytest
 
 from palpate_server.realtime.safety import Limits
-from palpate_server.session.leases import Leases, Refused
+from palpate_server.session.frame import IDENTITY
+from palpate_server.session.leases import Leases, Refused, ToolSettings
 
-CEILING = Limits(1.0, 1.0, 1.0, 1.0, 0.0)
+SETTINGS = ToolSettings(Limits(1.0, 1.0, 1.0, 1.0, 0.0), IDENTITY, (0.0, 0.0, 0.0))
 
 
-def test_a_held_contact_is_refused_to_others_and_not_to_its_holder() -> None:
-    leases = Leases(["a", "b"], CEILING)
+def leases_of(*tools: str) -> Leases:
+    return Leases(dict.fromkeys(tools, SETTINGS))
+
+
+def test_a_held_tool_is_refused_to_others_and_not_to_its_holder() -> None:
+    leases = leases_of("a", "b")
     leases.holders["a"] = "first"
     leases.check("first", ["a", "b"])
     with pytest.raises(Refused, match="first") as refusal:
@@ -19,14 +24,14 @@ def test_a_held_contact_is_refused_to_others_and_not_to_its_holder() -> None:
     assert refusal.value.reason == "held"
 
 
-def test_an_unknown_contact_is_refused_by_name() -> None:
+def test_an_unknown_tool_is_refused_by_name() -> None:
     with pytest.raises(Refused, match=r"'c'.*a, b") as refusal:
-        Leases(["a", "b"], CEILING).check("first", ["a", "c"])
-    assert refusal.value.reason == "unknown_contact"
+        leases_of("a", "b").check("first", ["a", "c"])
+    assert refusal.value.reason == "unknown_tool"
 
 
 def test_release_frees_what_the_client_held_and_nothing_else() -> None:
-    leases = Leases(["a", "b", "c"], CEILING)
+    leases = leases_of("a", "b", "c")
     leases.holders |= {"a": "first", "b": "second", "c": "first"}
     assert leases.held_by("first") == ("a", "c")
     assert leases.release("first") == ("a", "c")

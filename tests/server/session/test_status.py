@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from palpate.model_file import ReducedModel
+from palpate_client.wire import Flags, Keys, Kind, pack, unpack
 from palpate_server.realtime import shared_memory
-from palpate_server.realtime.safety import Flags, Limits
+from palpate_server.realtime.safety import Limits
 from palpate_server.session import status
-from palpate_server.session.leases import Leases
+from palpate_server.session.state import SessionState
 
 
 @pytest.mark.parametrize("scale_ns", [3e3, 5e4, 1e6])
@@ -51,11 +52,8 @@ def test_success_rate_is_the_share_of_recent_ticks_with_a_new_command(
 
 
 def test_the_status_message_is_plain_data(make_spring_mass_model: Callable[..., ReducedModel]) -> None:
-    import msgpack
-
-    model = make_spring_mass_model(2)
     limits = Limits(1.0, 1.0, 1.0, 1.0, 0.0)
-    memory = shared_memory.make_memory(model.discrete, model.period_s, [limits] * 2, 1 / 30)
-    leases = Leases(["tip", "tip1"], limits)
-    message = status.status(1, "running", 5, model, memory, status.MessageCounters(1), leases, 0, 0, None)
-    assert msgpack.unpackb(msgpack.packb(message))["contacts"]["tip1"]["holder"] is None
+    state = SessionState(make_spring_mass_model(2), limits, Keys("test"), 1 / 30)
+    message = unpack(pack(status.status(state, 1)), Kind.STATUS)
+    assert message["tools"]["tip1"]["holder"] is None
+    assert message["tools"]["tip1"]["home_m"] == list(state.model.contacts[1].center_m)

@@ -1,0 +1,134 @@
+"""Another model for a running session: checked in a process of its own, then faded over to. No tick waits for it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.files import LONGEST_NAME_BYTES, is_plain_name
+from palpate.model_file import ModelFileError, ReducedModel
+from palpate_server.realtime import scheduler, shared_memory
+from palpate_server.realtime.native_image import make_image
+from palpate_server.session.devices import warnings_for
+from palpate_server.session.fields import shown
+from palpate_server.session.leases import Refused
+from palpate_server.session.model_process import load_model_elsewhere
+from palpate_server.session.state import SessionState
+
+log = logging.getLogger("palpate_server")
+
+FADE_OVER_S = 0.5  # from one model to another
+TOLERABLE_ERROR = 0.1  # of the force in the band; people notice a difference of about 7 % (Jones 1989)
+
+
+class ModelLoader:
+    """Exchanges the model of a session for one from a folder."""
+
+    def __init__(self, state: SessionState, folder: Path) -> None:
+        self._state = state
+        self._folder = folder
+        self._handed_over: tuple[
+            shared_memory.Memory, ...
+        ] = ()  # what the loop may still run on at the very end
+
+    def load(self, client: str, file: object) -> dict[str, Any]:
+        """Check a model file, fade over to its model, and let the old one go. Raises Refused."""
+        state = self._state
+        if not state.exchanging.acquire(blocking=False):
+            raise Refused("busy", "another model is being loaded, or a tool acquired")
+        try:
+            state.check_alone(client)
+            model = self._read(file)
+            memory = self._fade_to(model)
+            with state.model_in_use:
+                self._end_exchange(memory)
+                state.memory, state.model = memory, model
+            log.info("now serving %s (order %d)", model.name, model.order)
+            for warning in accuracy_warnings(model):
+                log.warning("%s", warning)
+            return {
+                "model": {"name": model.name, "order": model.order, "config_sha256": model.config_sha256},
+                "warnings": accuracy_warnings(model) + warnings_of(state, state.leases.held_by(client)),
+            }
+        finally:
+            state.exchanging.release()
+
+    def _fade_to(self, model: ReducedModel) -> shared_memory.Memory:
+        """Have the loop fade over to a model that starts settled at the present displacement; the memory to go on with."""
+        state = self._state
+        following = shared_memory.make_model(model.discrete, state.memory.displacement.ravel().copy())
+        fade_step = model.period_s / FADE_OVER_S
+        fading = state.memory._replace(next_model=following, fade=np.array([0.0, fade_step]))
+        memory = state.memory._replace(
+            model=following,
+            snapshot_version=np.zeros(1, np.int64),
+            snapshot_tick=np.full(1, -1),
+            snapshot_state=np.zeros(model.order),
+        )
+        self._handed_over = (fading, memory)
+        state.undisturbed_since_tick = state.between_ticks(scheduler.exchange, make_image(fading))
+        while fading.fade[0] < 1.0:
+            if state.stopping.wait(model.period_s):
+                raise Refused("stopping", "the server is stopping")
+        return memory
+
+    def _end_exchange(self, memory: shared_memory.Memory) -> None:
+        """Once both models have run, the exchange is completed however late ticks are, unless the server stops."""
+        while True:
+            try:
+                self._state.between_ticks(scheduler.exchange, make_image(memory))
+                return
+            except Refused as error:
+                if error.reason != "busy":
+                    raise
+
+    def _read(self, name: object) -> ReducedModel:
+        if not is_plain_name(name):
+            raise Refused(
+                "bad_model",
+                f"file is {shown(name)}: expected a file's name, without a folder and of at most "
+                f"{LONGEST_NAME_BYTES} bytes",
+            )
+        path = self._folder / name
+        try:
+            if path.is_symlink() and path.resolve().parent != self._folder.resolve():
+                raise Refused("bad_model", f"{name}: leads out of the folder of models")
+            model = load_model_elsewhere(path, self._state.stopping)
+        except (OSError, RuntimeError, ModelFileError) as error:  # RuntimeError: links in a circle
+            raise Refused("bad_model", str(error).replace(f"{self._folder}/", "")) from error
+        if (names := tuple(contact.name for contact in model.contacts)) != self._state.tools:
+            raise Refused(
+                "bad_model", f"{name}: its tools are {names}, the running model's are {self._state.tools}"
+            )
+        if model.period_s != self._state.model.period_s:
+            raise Refused(
+                "bad_model",
+                f"{name}: its period is {model.period_s} s, the running model's {self._state.model.period_s} s",
+            )
+        return model
+
+
+def accuracy_warnings(model: ReducedModel) -> list[str]:
+    """What a model's own accuracy report says against serving it; empty when nothing does."""
+    error, (low, high) = model.accuracy.error_in_band, model.accuracy.band_hz
+    if error <= TOLERABLE_ERROR:
+        return []
+    return [
+        f"the force of the model {model.name!r} is wrong by up to {100 * error:.3g} % from {low:g} to {high:g} Hz "
+        "(error_in_band of its accuracy report)"
+    ]
+
+
+def warnings_of(state: SessionState, tools: Iterable[str]) -> list[str]:
+    """What whoever renders these tools with the device it named should know of the model that runs."""
+    warnings: list[str] = []
+    for name in tools:
+        settings = state.leases.settings[name]
+        if settings.device is not None:
+            index = state.tool_index[name]
+            warnings += warnings_for(settings.device, state.model, index, settings.frame.scale)
+    return list(dict.fromkeys(warnings))  # tools are often alike

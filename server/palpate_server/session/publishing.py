@@ -1,0 +1,151 @@
+"""What the server sends by itself: a force each tick, the status, and the surface while somebody listens."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import zenoh
+
+from palpate_client.wire import ENCODING, pack
+from palpate_server import wire
+from palpate_server.realtime import scheduler, shared_memory, threads
+from palpate_server.recording.black_box import BlackBox
+from palpate_server.session.state import SessionState
+from palpate_server.session.status import status
+
+log = logging.getLogger("palpate_server")
+
+MAX_UNSENT = 100  # ticks whose forces are still worth sending; what is older is dropped and counted
+
+
+class ForcePublisher:
+    """Sends the force of each tick, in order; `wake` is an eventfd that the deadline loop writes to after its ticks."""
+
+    def __init__(self, state: SessionState, session: zenoh.Session, wake: int) -> None:
+        self._state = state
+        self._wake = wake
+        self._sending = threading.Lock()
+        self._encoder = wire.ForceEncoder(len(state.tools))
+        self._sent = 0
+        self._publisher = session.declare_publisher(
+            state.keys.force,
+            encoding=ENCODING,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+            congestion_control=zenoh.CongestionControl.DROP,
+        )
+
+    def send(self) -> None:
+        """Publish the ticks that are not sent yet, unless another thread is at it (which then is told)."""
+        if self._sending.acquire(blocking=False):
+            self._send_and_release()
+        else:
+            os.eventfd_write(self._wake, 1)
+
+    def run(self) -> None:
+        """Send the forces of the deadline loop's ticks until the session stops."""
+        threads.raise_priority(threads.COMMAND_PRIORITY)  # that a force fades is told by this thread alone
+        while not self._state.stopping.is_set():
+            os.eventfd_read(self._wake)
+            self._sending.acquire()
+            with logged("forces could not be sent"):
+                self._send_and_release()
+
+    def _send_and_release(self) -> None:
+        try:
+            memory = self._state.memory
+            head = int(scheduler.records_written(memory.shared))
+            if head - self._sent > MAX_UNSENT:
+                self._state.messages.unsent_forces += head - self._sent - MAX_UNSENT
+                self._sent = head - MAX_UNSENT
+            while self._sent < head:
+                row = self._sent % shared_memory.RECORDS
+                start_ns = int(memory.record_times[row, shared_memory.START_NS])
+                payload = self._encoder.encode(
+                    self._sent, start_ns, memory.record_inputs[row], memory.record_motion[row]
+                )
+                self._publisher.put(payload)
+                self._sent += 1
+        finally:
+            self._sending.release()
+
+
+class StatusPublisher:
+    """Sends the status, and lets the black box look whether it has cause to write."""
+
+    def __init__(self, state: SessionState, session: zenoh.Session, black_box: BlackBox | None) -> None:
+        self._state = state
+        self._black_box = black_box
+        self._publishing = threading.Lock()
+        self._number = 0
+        self._publisher = session.declare_publisher(
+            state.keys.status,
+            encoding=ENCODING,
+            priority=zenoh.Priority.DATA,
+            congestion_control=zenoh.CongestionControl.DROP,
+        )
+
+    def publish(self) -> None:
+        """Any thread may call this. A mistake in a status does not end the service."""
+        with logged("the status could not be sent"), self._publishing:
+            recorder = self._state.recorder
+            self._number += 1
+            payload = pack(status(self._state, self._number))
+            self._publisher.put(payload)
+            if recorder is not None:
+                recorder.status(payload)
+            if self._black_box is not None:
+                self._black_box.examine(self._state.lost_clients)
+
+
+class SurfacePublisher:
+    """Sends the displacement of the surface, at the session's rate, while somebody listens."""
+
+    def __init__(self, state: SessionState, session: zenoh.Session) -> None:
+        self._state = state
+        self._tips = np.zeros((len(state.tools), 3))
+        self._last_tick = -1
+        self._publisher = session.declare_publisher(
+            state.keys.surface,
+            encoding=ENCODING,
+            priority=zenoh.Priority.DATA_LOW,
+            congestion_control=zenoh.CongestionControl.DROP,
+        )
+
+    def run(self) -> None:
+        """Until the session stops."""
+        state = self._state
+        due_s = time.monotonic()
+        while not state.stopping.wait(max(0.0, due_s - time.monotonic())):
+            due_s = max(due_s + state.surface_period_s, time.monotonic())
+            if self._publisher.matching_status:
+                with logged("the surface could not be sent"):
+                    self._publish()
+
+    def _publish(self) -> None:
+        state = self._state
+        with state.model_in_use:
+            surface = state.model.surface
+            model_state = np.zeros(state.model.order)
+            tick = scheduler.read_snapshot(state.image, model_state, self._tips)
+        if tick <= self._last_tick:
+            return
+        self._last_tick = tick
+        displacement = surface.output @ model_state.astype(np.float32)
+        displacement += surface.feedthrough @ self._tips.ravel().astype(np.float32)
+        self._publisher.put(wire.encode_surface(tick, time.monotonic_ns(), displacement))
+
+
+@contextmanager
+def logged(text: str) -> Iterator[None]:
+    """A mistake in one message must not end the thread that sends all of them: log it and go on."""
+    try:
+        yield
+    except Exception:
+        log.exception(text)

@@ -1,0 +1,60 @@
+"""Recordings that clients ask the server to make of itself, one at a time; they belong to no client."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from palpate_server.recording.recorder import Recorder, file_in
+from palpate_server.session.leases import Refused
+from palpate_server.session.state import SessionState
+from palpate_server.session.status import description
+
+_END_TIMEOUT_S = 1.0
+
+
+class Recordings:
+    """Begins and ends recordings in a folder, or refuses to where there is none."""
+
+    def __init__(self, state: SessionState, publish_status: Callable[[], None], folder: Path | None) -> None:
+        self._state = state
+        self._publish_status = publish_status
+        self._folder = folder
+        self._changing = threading.Lock()  # held while one begins or ends
+
+    def record(self, file: object) -> dict[str, Any]:
+        """Begin a recording in a new file, or end the one that runs when `file` is None. Raises Refused."""
+        if self._folder is None:
+            raise Refused("no_recordings", "the server was started without a folder for recordings")
+        if not self._changing.acquire(blocking=False):
+            raise Refused("busy", "a recording is being started or ended")
+        try:
+            report = self._end() if file is None else self._begin(file_in(self._folder, file))
+            return {"recording": report}
+        finally:
+            self._changing.release()
+
+    def close(self) -> None:
+        """End what is being recorded, when the server stops."""
+        if self._changing.acquire(timeout=_END_TIMEOUT_S) and self._state.recorder is not None:
+            self._state.recorder.stop()
+
+    def _begin(self, path: Path) -> dict[str, Any]:
+        state = self._state
+        state.check_running()
+        if state.recorder is not None and state.recorder.error is None:
+            raise Refused("busy", f"{state.recorder.file} is being recorded")
+        recorder = Recorder(path, state.keys, description(state), state.memory)
+        state.recorder = recorder
+        return recorder.report()
+
+    def _end(self) -> dict[str, Any]:
+        recorder = self._state.recorder
+        if recorder is None:
+            raise Refused("not_recording", "there is no recording to end")
+        self._publish_status()  # a replay reaches as far as the last status in the recording
+        self._state.recorder = None
+        recorder.stop()
+        return recorder.report()

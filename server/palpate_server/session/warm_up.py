@@ -1,0 +1,64 @@
+"""Compiles the functions of the real-time path before the first tick, or loads them from the cache."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+
+import numpy as np
+
+from palpate.model_file import StateSpace
+from palpate_server import wire
+from palpate_server.realtime import scheduler, shared_memory
+from palpate_server.realtime.native_image import make_image
+from palpate_server.realtime.safety import Limits
+
+log = logging.getLogger("palpate_server")
+
+_NOTICE_AFTER_S = 2.0
+
+
+def warm_up(period_s: float, n_tools: int) -> None:
+    """Call every compiled function once, on a model of its own; says so when that takes long."""
+    text = "compiling the real-time functions, once for this machine: about half a minute"
+    notice = threading.Timer(_NOTICE_AFTER_S, log.info, [text])
+    notice.daemon = True
+    notice.start()
+    try:
+        _call_each(period_s, n_tools)
+    finally:
+        notice.cancel()
+
+
+def _call_each(period_s: float, n_tools: int) -> None:
+    channels = 3 * n_tools
+    system = StateSpace(
+        np.zeros(2),
+        np.zeros(2),
+        np.zeros((2, channels)),
+        np.zeros((channels, 2)),
+        np.zeros((channels, channels)),
+    )
+    limits = [Limits(1.0, 1.0, 1.0, 1.0, 1.0)] * n_tools
+    memory = shared_memory.make_memory(system, period_s, limits, period_s)
+    scheduler.stage_command(memory.commands, 0, 1, 1, 1, -1, 0, wire.STILL, wire.STILL)
+    scheduler.write_command(memory.commands, 0, 1, 1, 1, -1, 0, wire.STILL, wire.STILL)
+    scheduler.forget_command(memory.commands, 0)
+    image = make_image(memory)
+    scheduler.tick_on_arrival(image, time.monotonic_ns())
+    scheduler.records_written(memory.shared)
+    wire.ForceEncoder(n_tools).encode(0, 0, memory.record_inputs[0], memory.record_motion[0])
+    scheduler.is_silent(image, 0)
+    scheduler.set_frame(image, 0, np.eye(3), 1.0, np.zeros(3))
+    scheduler.set_limits(image, 0, np.ones(len(Limits._fields)))
+    scheduler.reset(image)
+    scheduler.exchange(image, make_image(memory))
+    scheduler.changed_at(image)
+    scheduler.withdraw_change(image)
+    scheduler.read_snapshot(image, np.zeros(2), np.zeros((n_tools, 3)))
+    scheduler.stop(memory.shared)
+    wake = os.eventfd(0)
+    scheduler.run_at_deadlines(image, wake)
+    os.close(wake)
