@@ -89,7 +89,8 @@ def build(
     ] = None,
 ) -> None:
     """Build a scene into a model file and print the report of its accuracy."""
-    from palpate.model_file import check_writable, save_model
+    from palpate.files import check_output
+    from palpate.model_file import save_model
     from palpate.scene.schema import load_config, override_reduction
 
     if order is not None and tolerance is not None:
@@ -99,13 +100,14 @@ def build(
         wanted = None if tolerance is None else parse_tolerance(tolerance)
         scene = override_reduction(scene, method, order, wanted, "command line")
     path = output or Path(f"{scene.name}.npz")
-    check_writable(path)
+    inputs = [config]
+    check_output(path, inputs)
     start = time.monotonic()
     with stage_reporter() as report:
         from palpate.build import build_model
 
         model = build_model(scene, config.parent, report)
-    save_model(model, path)
+    save_model(model, path, inputs)
     print_accuracy(model)
     size = path.stat().st_size / 2**20
     console.print(

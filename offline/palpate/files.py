@@ -1,40 +1,113 @@
-"""Files that are there whole or not at all, and names that stay in their folder."""
+"""Names that are safe to show and to open, and files that are written as a whole or not at all."""
 
 from __future__ import annotations
 
 import os
+import stat
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TypeGuard
+from typing import BinaryIO, TypeGuard
 
 LONGEST_NAME_BYTES = 255  # on the usual file systems
+_LONGEST_SHOWN = 200
+
+
+def printable(text: object) -> str:
+    """The text of an object on one line, for a terminal or a log.
+
+    Control and bidirectional characters, line breaks and lone surrogates become escapes; long text is cut.
+    """
+    shown = str(text)
+    if len(shown) > _LONGEST_SHOWN:
+        shown = f"{shown[:_LONGEST_SHOWN]}... ({len(shown)} characters)"
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
 
 
 def is_plain_name(name: object) -> TypeGuard[str]:
-    """True for what can be a file's name, and leads into no other folder than the one it is looked for in."""
+    """True for the name of a file that lies directly in the folder where it is looked up, and that is safe to show."""
     return (
         isinstance(name, str)
         and name not in ("", ".", "..")
-        and Path(name).name == name
-        and "\0" not in name
+        and "/" not in name
+        and name.isprintable()
         and len(os.fsencode(name)) <= LONGEST_NAME_BYTES
     )
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write to a temporary file beside `path`, then rename: readers see the old file or the whole new one.
+def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
+    """Check that a file can be written at `path`. Called before long work, and again before the file is replaced.
 
-    Makes the folders that are missing. Raises OSError; then nothing is left behind.
+    inputs  files that the same command reads; none of them may be overwritten
+
+    Raises OSError, in one line that names the path, if it is a folder, link, device, pipe or socket, if it is one of
+    the inputs, or if its folder can't be written to.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    shown = printable(path)
+    kind = _kind(path)
+    if kind not in ("", "plain file"):
+        raise OSError(f"{shown} is a {kind}: expected a plain file or a new name")
+    for file in inputs:
+        if kind and file.exists() and path.samefile(file):
+            raise OSError(f"{shown} is an input of this command: expected another name for the output")
+    folder = path.parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
     try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(f"{shown}: can't write to {printable(folder)} ({error.strerror})") from error
+
+
+def write_atomically(path: Path, data: bytes, inputs: Iterable[Path] = ()) -> None:
+    """Write a temporary file beside `path`, then rename it: readers see the old file or the complete new one.
+
+    Makes the folders that are missing. Raises OSError as `check_output` does and when the disk is full; then nothing
+    is left behind.
+    """
+    check_output(path, inputs)
+    temporary: Path | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=".palpate-", suffix=".part")
+        temporary = Path(name)
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    except OSError as error:
+        raise OSError(f"{printable(path)}: could not be written: {error.strerror}") from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def create_new(path: Path) -> BinaryIO:
+    """A new file, open for writing. Raises OSError, in one line, if the name is taken or can't be created."""
+    try:
+        return path.open("xb")
+    except FileExistsError:
+        raise OSError(f"{printable(path)} exists: expected the name of a new file") from None
+    except OSError as error:
+        raise OSError(f"{printable(path)}: could not be created: {error.strerror}") from error
+
+
+def _kind(path: Path) -> str:
+    """What lies at `path`, links not followed; empty if nothing does."""
+    try:
+        mode = path.lstat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return ""
+    except OSError as error:
+        raise OSError(f"{printable(path)}: {error.strerror}") from error
+    tests = {
+        "plain file": stat.S_ISREG,
+        "folder": stat.S_ISDIR,
+        "link": stat.S_ISLNK,
+        "pipe": stat.S_ISFIFO,
+        "socket": stat.S_ISSOCK,
+    }
+    return next((name for name, test in tests.items() if test(mode)), "device")

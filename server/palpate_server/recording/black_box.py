@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.files import write_whole
+from palpate.files import write_atomically
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.safety import Flags
 
@@ -126,7 +126,7 @@ class BlackBox:
                 force_scale=motion[:, :, shared_memory.SCALE],
                 energy_j=motion[:, :, shared_memory.ENERGY_J],
             )
-            write_whole(path, buffer.getvalue())
+            write_atomically(path, buffer.getvalue())
         except OSError as error:
             log.warning("black box %s could not be written: %s", path, error)
         else:

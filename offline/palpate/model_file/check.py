@@ -1,0 +1,133 @@
+"""What the values of a model must fulfil, whether it is about to be written or has just been read."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from palpate.files import printable
+from palpate.model_file.members import Header, arrays_of, check_shapes
+from palpate.model_file.types import (
+    LONGEST_PERIOD_S,
+    SHORTEST_PERIOD_S,
+    AccuracyReport,
+    Contact,
+    ModelFileError,
+    ReducedModel,
+)
+
+_LONGEST_NAME = 64
+_LONGEST_TEXT = 200
+
+
+def check_model(model: ReducedModel) -> None:
+    """Check everything about a model but what only a file has.
+
+    Raises ModelFileError, in one line that names the field and what was expected.
+    """
+    _text("name", model.name, _LONGEST_NAME)
+    _text("method", model.method, _LONGEST_TEXT)
+    _text("built_with", model.built_with, _LONGEST_TEXT)
+    _config(model)
+    _number("period_s", model.period_s, SHORTEST_PERIOD_S, LONGEST_PERIOD_S)
+    _whole("n_nodes", model.n_nodes)
+    _whole("n_states_full", model.n_states_full)
+    _contacts(model.contacts)
+    _accuracy(model)
+    _arrays(model)
+    _stable(model)
+
+
+def refuse(field: str, value: object, expected: str) -> ModelFileError:
+    """The error that says what a field is and what was expected. Pass the repr of what comes from a file."""
+    return ModelFileError(f"field '{field}' is {printable(value)}: expected {expected}")
+
+
+def _text(field: str, value: object, longest: int) -> None:
+    if not (isinstance(value, str) and 0 < len(value) <= longest and value.isprintable()):
+        raise refuse(field, repr(value), f"text of 1 to {longest} printable characters")
+
+
+def _config(model: ReducedModel) -> None:
+    try:
+        model.config.encode()
+    except (AttributeError, UnicodeEncodeError):
+        raise refuse("config", repr(model.config), "Unicode text") from None
+    digest = model.config_sha256
+    if not (isinstance(digest, str) and len(digest) in (0, 64) and set(digest) <= set("0123456789abcdef")):
+        raise refuse("config_sha256", repr(digest), "64 lower-case hexadecimal digits, or none")
+
+
+def _number(field: str, value: Any, low: float = -math.inf, high: float = math.inf) -> None:
+    """Check for a finite number from low to high."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not (is_number and -1e300 < value < 1e300 and low <= value <= high):
+        limits = [f"at least {low:g}"] * (low > -math.inf) + [f"at most {high:g}"] * (high < math.inf)
+        raise refuse(field, repr(value), " ".join(["a finite number", " and ".join(limits)]).strip())
+
+
+def _whole(field: str, value: Any) -> None:
+    if type(value) is not int or not 0 < value < 2**53:
+        raise refuse(field, repr(value), "an integer of at least 1")
+
+
+def _contacts(contacts: tuple[Contact, ...]) -> None:
+    for index, contact in enumerate(contacts):
+        where = f"contacts[{index}]"
+        _text(f"{where}.name", contact.name, _LONGEST_NAME)
+        for name in ("center_m", "normal"):
+            vector = getattr(contact, name)
+            if len(vector) != 3:
+                raise refuse(f"{where}.{name}", vector, "three numbers")
+            for value in vector:
+                _number(f"{where}.{name}", value, -1e3, 1e3)
+        if not abs(math.hypot(*contact.normal) - 1) < 1e-6:
+            raise refuse(f"{where}.normal", contact.normal, "a vector of length 1")
+        _number(f"{where}.radius_m", contact.radius_m, 1e-9, 1e3)
+        _whole(f"{where}.n_nodes", contact.n_nodes)
+    names = [contact.name for contact in contacts]
+    if not names or len(set(names)) < len(names):
+        raise refuse("contacts", names, "at least one contact, and each name once")
+
+
+def _accuracy(model: ReducedModel) -> None:
+    accuracy = model.accuracy
+    for field in fields(AccuracyReport):
+        value, name = getattr(accuracy, field.name), f"accuracy.{field.name}"
+        if field.type == "float" or (field.type == "float | None" and value is not None):
+            _number(name, value, 0.0 if field.name.startswith("error") else -math.inf)
+    band, highest = accuracy.band_hz, 0.5 / model.period_s
+    if len(band) != 2:
+        raise refuse("accuracy.band_hz", band, "two numbers")
+    for value in band:
+        _number("accuracy.band_hz", value, 0.0, highest)
+    if not band[0] < band[1]:
+        raise refuse("accuracy.band_hz", band, "its lower end below its upper")
+
+
+def _arrays(model: ReducedModel) -> None:
+    arrays = arrays_of(model)
+    check_shapes({name: Header(array.dtype.str, array.shape) for name, array in arrays.items()})
+    channels = len(model.static_stiffness)
+    if channels != model.n_inputs:
+        raise refuse("static_stiffness", f"{channels} rows", f"{model.n_inputs}, three for each contact")
+    for name, array in arrays.items():
+        if not np.all(np.isfinite(array)):
+            raise refuse(name, "not finite in some places", "finite numbers")
+    triangles, n_vertices = model.surface.triangles, len(model.surface.vertices)
+    if triangles.size and not (triangles.min() >= 0 and triangles.max() < n_vertices):
+        raise refuse("surface_triangles", triangles.max(), f"indices of vertices, 0 to {n_vertices - 1}")
+
+
+def _stable(model: ReducedModel) -> None:
+    """Check that every 2x2 block [[a, b], [c, d]] of the discrete state matrix has eigenvalues inside the unit circle."""
+    a = model.discrete
+    blocks = np.stack([a.diagonal[0::2], a.cross[0::2], a.cross[1::2], a.diagonal[1::2]], axis=-1)
+    radius = float(np.max(np.abs(np.linalg.eigvals(blocks.reshape(-1, 2, 2)))))
+    if radius >= 1:
+        raise ModelFileError(
+            f"field 'discrete_diagonal' is of an unstable model, spectral radius {radius:.9f}: expected below 1"
+        )

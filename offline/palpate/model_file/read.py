@@ -1,0 +1,276 @@
+"""Reading a model file that nobody vouches for: what it declares is checked before any of its data is unpacked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import zipfile
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import IO, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.files import printable
+from palpate.model_file.check import check_model, refuse
+from palpate.model_file.members import (
+    ARRAYS,
+    CHECKSUM,
+    MAX_METADATA_BYTES,
+    MAX_TOTAL_BYTES,
+    METADATA,
+    Header,
+    check_shapes,
+)
+from palpate.model_file.types import (
+    FORMAT,
+    SCHEMA_VERSION,
+    UNITS,
+    AccuracyReport,
+    Contact,
+    ModelFileError,
+    PoleResidueSystem,
+    ReducedModel,
+    StateSpace,
+    Surface,
+)
+
+_END = b"PK\5\6"  # opens the zip's last record, of 22 bytes
+_END_OF_ZIP64 = b"PK\6\7"
+_MAX_DIRECTORY_BYTES = 2**16
+_MAX_HEADER_BYTES = 1024
+_CHUNK_BYTES = 2**20
+
+# The header as numpy writes it. Nothing in a file is evaluated or unpickled.
+_NPY_HEADER = re.compile(
+    rb"\{'descr': '([<|][a-z]\d{1,2})', 'fortran_order': False, 'shape': \(((?:\d{1,10}, ?)*(?:\d{1,10})?)\), \} *\n"
+)
+
+Part = TypeVar("Part")
+
+
+def load_model(path: Path) -> ReducedModel:
+    """Read and check a model file. Memory stays within twice `MAX_TOTAL_BYTES`, whatever the file holds.
+
+    Raises FileNotFoundError if there is none, OSError if it can't be opened, and ModelFileError, in one line that names
+    the field, if it is damaged, cut short, foreign, of another schema, or inconsistent in itself.
+    """
+    shown = printable(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{shown}: no such model file")
+    with path.open("rb") as file:
+        try:
+            model = _read(file)
+            check_model(model)
+        except ModelFileError as error:
+            raise ModelFileError(f"{shown}: {error}") from error
+        except MemoryError:
+            raise
+        except Exception as error:  # zipfile and zlib raise a dozen kinds on damaged bytes
+            cause = printable(error) or type(error).__name__
+            raise ModelFileError(f"{shown}: damaged or not an .npz archive ({cause})") from error
+    return model
+
+
+def _read(file: IO[bytes]) -> ReducedModel:
+    _check_directory(file)
+    with zipfile.ZipFile(file) as archive:
+        members = _members(archive)
+        scalars = _metadata(archive, members)
+        for name in members:
+            if name not in (METADATA, CHECKSUM, *ARRAYS):
+                raise ModelFileError(f"field '{printable(name)}' is unknown: expected none beside a model's")
+        headers = {name: _open(archive, members, name)[1] for name in ARRAYS}
+        check_shapes(headers)
+        arrays = _data(archive, members)
+    return _assemble(scalars, arrays)
+
+
+def _check_directory(file: IO[bytes]) -> None:
+    """Check the zip's last record before zipfile reads the list of members, however long it says that is."""
+    size = file.seek(0, 2)
+    file.seek(max(0, size - 42))
+    tail = file.read(42)
+    record = tail[-22:]
+    if record[:4] != _END or record[20:] != b"\0\0" or tail[:4] == _END_OF_ZIP64:
+        raise ModelFileError("damaged or not an .npz archive (no zip directory at its end; is it cut short?)")
+    if int.from_bytes(record[12:16], "little") > _MAX_DIRECTORY_BYTES:
+        raise ModelFileError(f"damaged: its zip directory is longer than {_MAX_DIRECTORY_BYTES} bytes")
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """The members by name, without `.npy`; their declared sizes are within bounds."""
+    members: dict[str, zipfile.ZipInfo] = {}
+    for entry in archive.infolist():
+        name = entry.filename.removesuffix(".npy")
+        if name in members:
+            raise ModelFileError(f"field '{printable(name)}' is there twice: expected it once")
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or entry.flag_bits & ~0x800:
+            raise ModelFileError(
+                f"field '{printable(name)}' is packed otherwise: expected stored or deflated"
+            )
+        members[name] = entry
+    if METADATA not in members:
+        raise ModelFileError("field 'metadata' is missing: not a palpate model")
+    total = sum(entry.file_size for entry in members.values())
+    if total > MAX_TOTAL_BYTES:
+        raise ModelFileError(f"its members unpack to {total:,} bytes: expected at most {MAX_TOTAL_BYTES:,}")
+    if members[METADATA].file_size > MAX_METADATA_BYTES:
+        raise refuse(METADATA, f"{members[METADATA].file_size:,} bytes", f"at most {MAX_METADATA_BYTES:,}")
+    return members
+
+
+def _open(
+    archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], name: str
+) -> tuple[IO[bytes], Header, bytes]:
+    """(stream at the first byte of the data, header, header's bytes) of a member whose size is what it declares."""
+    if name not in members:
+        raise ModelFileError(f"field '{name}' is missing")
+    stream = archive.open(members[name])
+    opening = stream.read(10)
+    length = int.from_bytes(opening[8:], "little")
+    text = stream.read(length) if length <= _MAX_HEADER_BYTES else b""
+    match = _NPY_HEADER.fullmatch(text)
+    if opening[:8] != b"\x93NUMPY\1\0" or match is None:
+        raise refuse(
+            name, "in another form", "an array in .npy format 1.0, in C order, without Python objects"
+        )
+    shape = tuple(int(n) for n in match[2].replace(b" ", b"").split(b",") if n)
+    header = Header(match[1].decode(), shape)
+    if len(opening) + length + header.n_bytes != members[name].file_size:
+        raise refuse(
+            name, header, f"an array of the {members[name].file_size:,} bytes that the archive declares"
+        )
+    return stream, header, opening + text
+
+
+def _take(
+    archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], name: str, digest: Any
+) -> NDArray[Any]:
+    """The array of a member; `digest` takes in its name and bytes."""
+    stream, header, opening = _open(archive, members, name)
+    digest.update(name.encode() + b"\0" + opening)
+    array = np.empty(header.shape, dtype=header.dtype)
+    data = array.reshape(-1).view(np.uint8).data
+    with stream:
+        for start in range(0, len(data), _CHUNK_BYTES):
+            chunk = data[start : start + _CHUNK_BYTES]
+            piece = stream.read(len(chunk))
+            if len(piece) < len(chunk):
+                raise refuse(name, "cut short", f"{header.n_bytes:,} bytes of data")
+            chunk[:] = piece
+            digest.update(piece)
+    return array
+
+
+def _bytes(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], name: str) -> bytes:
+    _, header, _ = _open(archive, members, name)
+    if header.dtype != "|u1" or len(header.shape) != 1:
+        raise refuse(name, header, "|u1 in one dimension")
+    return _take(archive, members, name, hashlib.sha256()).tobytes()
+
+
+def _data(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]) -> dict[str, NDArray[Any]]:
+    """The arrays, once the checksum of all members has been found right."""
+    digest = hashlib.sha256()
+    arrays = {name: _take(archive, members, name, digest) for name in sorted([*ARRAYS, METADATA])}
+    if _bytes(archive, members, CHECKSUM) != digest.digest():
+        raise ModelFileError(
+            "field 'sha256' is not the checksum of the content: the file is damaged, build it again"
+        )
+    return arrays
+
+
+def _metadata(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]) -> dict[str, Any]:
+    text = _bytes(archive, members, METADATA)
+    try:
+        scalars = json.loads(text.decode())
+    except (ValueError, RecursionError) as error:
+        cause = "nested too deeply" if isinstance(error, RecursionError) else printable(error)
+        raise ModelFileError(f"field 'metadata' is not JSON: {cause}") from error
+    if not isinstance(scalars, dict) or scalars.get("format") != FORMAT:
+        shown = scalars.get("format") if isinstance(scalars, dict) else scalars
+        raise refuse("format", repr(shown), f"{FORMAT!r}; not a palpate model")
+    version = scalars.get("schema_version")
+    if version != SCHEMA_VERSION:
+        newer = type(version) is int and version > SCHEMA_VERSION
+        hint = (
+            "it was written by a newer palpate, upgrade this one"
+            if newer
+            else "it was written by an older palpate, build it again with `palpate build`"
+        )
+        raise refuse("schema_version", repr(version), f"{SCHEMA_VERSION}; {hint}")
+    if scalars.get("kind") != ReducedModel.kind:
+        raise refuse(
+            "kind", repr(scalars.get("kind")), f"{ReducedModel.kind!r}, the kind that this version can run"
+        )
+    return scalars
+
+
+def _assemble(scalars: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> ReducedModel:
+    """The model, of parts whose values have not been checked yet."""
+    plain = [
+        "name",
+        "method",
+        "period_s",
+        "n_nodes",
+        "n_states_full",
+        "config",
+        "config_sha256",
+        "built_with",
+    ]
+    _exactly(scalars, "", ["format", "schema_version", "kind", "units", *plain, "contacts", "accuracy"])
+    _exactly(scalars["units"], "units.", list(UNITS))
+    for quantity, unit in UNITS.items():
+        if scalars["units"][quantity] != unit:
+            raise refuse(f"units.{quantity}", repr(scalars["units"][quantity]), repr(unit))
+    if not isinstance(scalars["contacts"], list):
+        raise refuse("contacts", repr(scalars["contacts"]), "a list")
+    of_file = [field.name for field in fields(AccuracyReport) if field.name != "hankel_singular_values"]
+    _exactly(scalars["accuracy"], "accuracy.", of_file)
+    band = _numbers(scalars["accuracy"]["band_hz"], "accuracy.band_hz")
+    return ReducedModel(
+        **{name: scalars[name] for name in plain},
+        contacts=tuple(_contact(table, f"contacts[{i}].") for i, table in enumerate(scalars["contacts"])),
+        continuous=_part(StateSpace, arrays, "continuous"),
+        discrete=_part(StateSpace, arrays, "discrete"),
+        full=_part(PoleResidueSystem, arrays, "full"),
+        static_stiffness=arrays["static_stiffness"],
+        surface=_part(Surface, arrays, "surface"),
+        accuracy=AccuracyReport(
+            **scalars["accuracy"] | {"band_hz": band}, hankel_singular_values=arrays["hankel_singular_values"]
+        ),
+    )
+
+
+def _contact(table: Any, where: str) -> Contact:
+    _exactly(table, where, [field.name for field in fields(Contact)])
+    vectors = {name: _numbers(table[name], where + name) for name in ("center_m", "normal")}
+    return Contact(**table | vectors)
+
+
+def _part(kind: Callable[..., Part], arrays: dict[str, NDArray[Any]], group: str) -> Part:
+    """A group of arrays, such as `discrete_...`, as one data class."""
+    prefix = f"{group}_"
+    return kind(**{n.removeprefix(prefix): array for n, array in arrays.items() if n.startswith(prefix)})
+
+
+def _numbers(value: Any, field: str) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise refuse(field, repr(value), "a list of numbers")
+    return tuple(value)
+
+
+def _exactly(table: Any, where: str, names: list[str]) -> None:
+    """Check that a table of the metadata has these keys and no other."""
+    if not isinstance(table, dict):
+        raise refuse(where.rstrip(".") or METADATA, repr(table), "a table")
+    for name in names:
+        if name not in table:
+            raise ModelFileError(f"field '{where}{name}' is missing")
+    for name in table:
+        if name not in names:
+            raise ModelFileError(f"field '{where}{printable(name)}' is unknown: expected {', '.join(names)}")

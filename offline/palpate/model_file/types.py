@@ -1,0 +1,214 @@
+"""The data classes of a model. `docs/model-file.md` describes them as they lie in a file."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+FORMAT = "palpate.reduced-model"
+SCHEMA_VERSION = 2
+
+SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-4, 1e-1
+
+UNITS = {
+    "length": "m",
+    "displacement": "m",
+    "force": "N",
+    "stiffness": "N/m",
+    "time": "s",
+    "frequency": "Hz",
+    "energy": "J",
+    "pole": "1/s",
+}
+
+Array = NDArray[np.float64]
+
+
+class ModelFileError(ValueError):
+    """A file is not a model that this version can run; the message says why in one line."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A patch of the surface that moves as one rigid tip: 3 inputs (x, y, z displacement), 3 outputs (force).
+
+    center_m and normal are in the model frame; the normal is the unit outward one. The force is what the tissue
+    is held with: it points along the displacement in statics, so a device renders its negative.
+    """
+
+    name: str
+    center_m: tuple[float, float, float]
+    normal: tuple[float, float, float]
+    radius_m: float
+    n_nodes: int
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """A real system in block-diagonal form: state i is coupled to itself and to its partner i XOR 1 alone.
+
+    A[i, i] = diagonal[i] and A[i, i ^ 1] = cross[i]; a complex pair a +- jb is [[a, b], [-b, a]], two real poles
+    share a block with cross = 0, and an odd number of real poles is padded with a state that nothing drives.
+
+    diagonal, cross  (order,), order even
+    b (order, n_inputs), c (n_outputs, order), d (n_outputs, n_inputs)
+    """
+
+    diagonal: Array
+    cross: Array
+    b: Array
+    c: Array
+    d: Array
+
+    @property
+    def order(self) -> int:
+        return len(self.diagonal)
+
+    def dense_a(self) -> Array:
+        """(order, order), the state matrix A."""
+        a = np.diag(self.diagonal)
+        i = np.arange(self.order)
+        a[i, i ^ 1] = self.cross
+        return a
+
+
+@dataclass(frozen=True)
+class PoleResidueSystem:
+    """The full model, kept beside the reduced one so that anyone can check what the server answers:
+
+        F(s) = D + sum_i c_i b_i^T / (s - p_i), each pole above the real axis standing for its conjugate too.
+
+    poles (n_poles,), imaginary part >= 0, 1/s
+    b (n_poles, n_inputs), c (n_outputs, n_poles), complex; d (n_outputs, n_inputs), N/m
+    """
+
+    poles: NDArray[np.complex128]
+    b: NDArray[np.complex128]
+    c: NDArray[np.complex128]
+    d: Array
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The body's surface and how it moves with the reduced model's state.
+
+    vertices     (n_vertices, 3), m, at rest
+    triangles    (n_triangles, 3), vertex indices, counter-clockwise from outside
+    output       (3 n_vertices, order), float32: displacement in m from the *discrete* state,
+                 ordered x, y, z of vertex 0, then of vertex 1, ...
+    feedthrough  (3 n_vertices, n_inputs), float32: the part that follows the newest input at once
+    """
+
+    vertices: Array
+    triangles: NDArray[np.int32]
+    output: NDArray[np.float32]
+    feedthrough: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class AccuracyReport:
+    """How good the reduced model is, measured against the full one. Relative errors are fractions.
+
+    error_in_band          largest over the band of |F_full - F| / |F_full| (2-norms, at each frequency), F being the
+                           discrete model that runs: reduction and sampling together
+    error_in_band_continuous  the same of the reduced model before it is sampled: the reduction alone
+    error_static           the same at 0 Hz
+    error_hinf             largest over all frequencies of |F_full - F_reduced|, over the largest |F_full|
+    error_bound            a-priori bound in the norm of error_hinf, or None where the method has none
+    error_time_domain      on a poke: largest force error over the largest force, discrete model against exact response
+    error_surface_in_band  surface displacement in the band: largest over the frequencies of |error| over |displacement|
+    spectral_abscissa      largest real part of the reduced poles, 1/s
+    spectral_abscissa_full the same of the full model, 1/s
+    passivity_margin       smallest eigenvalue, over all frequencies, of the part of the discrete force response that
+                           dissipates, (F - F^H) / 2j, over |F(0)|; negative: the model can give out energy
+    passive_up_to_hz       no sinusoidal poke slower than this gets energy out of the discrete model (more than a margin of
+                           -0.001 would); half the sampling rate where it is passive throughout
+    largest_energy_out_j   the most energy it can give out in one closed sinusoidal poke of 1 mm amplitude, J
+    resolved_frequency_hz  up to where the cloud carries shear waves with 6 nodes a wavelength
+    band_hz                the haptic band
+    hankel_singular_values (k,), of the reduction's own Gramians, largest first; empty for modal methods
+    """
+
+    error_in_band: float
+    error_in_band_continuous: float
+    error_static: float
+    error_hinf: float
+    error_bound: float | None
+    error_time_domain: float
+    error_surface_in_band: float
+    spectral_abscissa: float
+    spectral_abscissa_full: float
+    passivity_margin: float
+    passive_up_to_hz: float
+    largest_energy_out_j: float
+    resolved_frequency_hz: float
+    band_hz: tuple[float, float]
+    hankel_singular_values: Array
+
+
+@dataclass(frozen=True)
+class ReducedModel:
+    """All that the server needs to run a body, and all that a person needs to trust it.
+
+    continuous  the reduced model dx/dt = A x + B u, F = C x + D u (u displacement in m, F force in N)
+    discrete    the same sampled at period_s, in the form that runs:
+                F = C xi + D u, then xi+ = A xi + B u with the newest sample u
+    full        the model that was reduced; nothing at run time needs it
+    static_stiffness (n_outputs, n_inputs), N/m, of the full model; instant stiffness is continuous.d
+    config      the configuration it was built from, defaults filled in, as JSON; config_sha256 is the hash of that
+                and of the surface file
+    """
+
+    kind: ClassVar[str] = "patch"
+
+    name: str
+    method: str
+    period_s: float
+    n_nodes: int
+    n_states_full: int
+    contacts: tuple[Contact, ...]
+    continuous: StateSpace
+    discrete: StateSpace
+    full: PoleResidueSystem
+    static_stiffness: Array
+    surface: Surface
+    accuracy: AccuracyReport
+    config: str
+    config_sha256: str
+    built_with: str
+
+    @property
+    def order(self) -> int:
+        return self.discrete.order
+
+    @property
+    def n_inputs(self) -> int:
+        return 3 * len(self.contacts)
+
+    def summary(self) -> dict[str, Any]:
+        """What `palpate inspect --json` prints: plain numbers, lists and strings."""
+        accuracy = asdict(self.accuracy)
+        accuracy["hankel_singular_values"] = self.accuracy.hankel_singular_values.tolist()
+        return {
+            "format": FORMAT,
+            "schema_version": SCHEMA_VERSION,
+            "kind": self.kind,
+            "name": self.name,
+            "method": self.method,
+            "order": self.order,
+            "n_nodes": self.n_nodes,
+            "n_states_full": self.n_states_full,
+            "period_s": self.period_s,
+            "contacts": [asdict(c) for c in self.contacts],
+            "static_stiffness_n_per_m": self.static_stiffness.tolist(),
+            "instant_stiffness_n_per_m": self.continuous.d.tolist(),
+            "n_surface_vertices": len(self.surface.vertices),
+            "n_surface_triangles": len(self.surface.triangles),
+            "units": UNITS,
+            "config_sha256": self.config_sha256,
+            "built_with": self.built_with,
+            "accuracy": accuracy,
+        }
