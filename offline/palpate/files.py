@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import BinaryIO, TypeGuard
 
 LONGEST_NAME_BYTES = 255  # on the usual file systems
-_LONGEST_SHOWN = 200
 
 
-def printable(text: object) -> str:
-    """The text of an object on one line, for a terminal or a log.
+def printable(text: object, longest: int | None = None) -> str:
+    """The text of an object on one line, for a terminal or a log, cut after `longest` characters.
 
-    Control and bidirectional characters, line breaks and lone surrogates become escapes; long text is cut.
+    Control and bidirectional characters, line breaks and lone surrogates become escapes.
     """
     shown = str(text)
-    if len(shown) > _LONGEST_SHOWN:
-        shown = f"{shown[:_LONGEST_SHOWN]}... ({len(shown)} characters)"
+    if longest is not None and len(shown) > longest:
+        shown = f"{shown[:longest]}... ({len(shown)} characters)"
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
 
 

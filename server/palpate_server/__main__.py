@@ -16,13 +16,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import zenoh
 
+from palpate.files import printable
 from palpate.model_file import ModelFileError, ReducedModel, load_model
 from palpate_client.wire import Keys
 from palpate_server.arguments import index, need, positive
 from palpate_server.realtime.safety import Limits, least_force_rate
 from palpate_server.session import log_limit, transport
 from palpate_server.session.loading import accuracy_warnings
-from palpate_server.session.log_limit import printable
 from palpate_server.session.server import FASTEST_SURFACE_HZ, USUAL_SURFACE_HZ, ServerOptions, serve
 
 log = logging.getLogger("palpate_server")

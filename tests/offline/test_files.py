@@ -120,4 +120,4 @@ def test_names_that_can_be_used() -> None:
 
 def test_what_is_shown_is_one_printable_line() -> None:
     assert printable("a\n\x1b[31m\u202e\ud800é") == r"a\n\x1b[31m\u202e\ud800é"
-    assert printable("x" * 1000) == "x" * 200 + "... (1000 characters)"
+    assert printable("x" * 1000, 200) == "x" * 200 + "... (1000 characters)"

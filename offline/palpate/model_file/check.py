@@ -43,7 +43,7 @@ def check_model(model: ReducedModel) -> None:
 
 def refuse(field: str, value: object, expected: str) -> ModelFileError:
     """The error that says what a field is and what was expected. Pass the repr of what comes from a file."""
-    return ModelFileError(f"field '{field}' is {printable(value)}: expected {expected}")
+    return ModelFileError(f"field '{field}' is {printable(value, _LONGEST_TEXT)}: expected {expected}")
 
 
 def _text(field: str, value: object, longest: int) -> None:

@@ -82,7 +82,9 @@ def _read(file: IO[bytes]) -> ReducedModel:
         scalars = _metadata(archive, members)
         for name in members:
             if name not in (METADATA, CHECKSUM, *ARRAYS):
-                raise ModelFileError(f"field '{printable(name)}' is unknown: expected none beside a model's")
+                raise ModelFileError(
+                    f"field '{printable(name, 80)}' is unknown: expected none beside a model's"
+                )
         headers = {name: _open(archive, members, name)[1] for name in ARRAYS}
         check_shapes(headers)
         arrays = _data(archive, members)
@@ -107,10 +109,10 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     for entry in archive.infolist():
         name = entry.filename.removesuffix(".npy")
         if name in members:
-            raise ModelFileError(f"field '{printable(name)}' is there twice: expected it once")
+            raise ModelFileError(f"field '{printable(name, 80)}' is there twice: expected it once")
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or entry.flag_bits & ~0x800:
             raise ModelFileError(
-                f"field '{printable(name)}' is packed otherwise: expected stored or deflated"
+                f"field '{printable(name, 80)}' is packed otherwise: expected stored or deflated"
             )
         members[name] = entry
     if METADATA not in members:
@@ -273,4 +275,6 @@ def _exactly(table: Any, where: str, names: list[str]) -> None:
             raise ModelFileError(f"field '{where}{name}' is missing")
     for name in table:
         if name not in names:
-            raise ModelFileError(f"field '{where}{printable(name)}' is unknown: expected {', '.join(names)}")
+            raise ModelFileError(
+                f"field '{where}{printable(name, 80)}' is unknown: expected {', '.join(names)}"
+            )

@@ -7,6 +7,8 @@ import sys
 import threading
 import time
 
+from palpate.files import printable
+
 MOST_LINES, PER_SECONDS = 5, 10.0  # of one kind
 
 
@@ -53,8 +55,3 @@ def set_up() -> None:
     handler.setFormatter(OneLine("%(message)s"))
     handler.addFilter(RateLimit())
     logging.basicConfig(level=logging.INFO, handlers=[handler])
-
-
-def printable(text: str) -> str:
-    """The text with every character that is no letter, mark, sign or space as an escape."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

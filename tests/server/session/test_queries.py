@@ -10,8 +10,9 @@ import msgpack
 import pytest
 import zenoh
 
+from palpate.files import printable
 from palpate_client.wire import ENCODING, Keys, pack
-from palpate_server.session.log_limit import MOST_LINES, OneLine, RateLimit, printable
+from palpate_server.session.log_limit import MOST_LINES, OneLine, RateLimit
 from palpate_server.session.queries import MAX_WAITING, Queries
 
 REQUEST = pack({"kind": "request", "schema_version": 2})
