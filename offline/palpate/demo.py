@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from palpate.build import Report, build_model
+from palpate.build import build_model
 from palpate.lti.pole_residue import full_system
 from palpate.model_file import ModelFileError, ReducedModel, load_model, save_model
 from palpate.plots import Touch, draw_touch, require_matplotlib
+from palpate.progress import Progress
 from palpate.scene.schema import fingerprint, load_config
 
 Array = NDArray[np.float64]
@@ -70,7 +71,7 @@ class Demo:
         console.print("\n".join(lines), highlight=False, soft_wrap=True)
 
 
-def run_demo(config_path: Path, out: Path, seconds: float, report: Report) -> Demo:
+def run_demo(config_path: Path, out: Path, seconds: float, progress: Progress) -> Demo:
     """Build (unless `out` holds a model of the very same configuration), serve, poke for `seconds`, draw.
 
     Raises what `build_model` raises, and ValueError when server or client fail, with what they said.
@@ -78,13 +79,13 @@ def run_demo(config_path: Path, out: Path, seconds: float, report: Report) -> De
     require_matplotlib()
     out.mkdir(parents=True, exist_ok=True)
     model_path = out / f"{config_path.stem}.npz"
-    model = _built(model_path, config_path, report)
+    model = _built(model_path, config_path, progress)
     recording = out / "poke.csv"
-    with _server(model_path, report) as endpoint:
-        report(f"poke, {seconds:g} s")
+    with _server(model_path, progress) as endpoint:
+        progress(f"poke, {seconds:g} s")
         client = _poke(endpoint, seconds, recording)
-        report.note(f"{client['commands_answered']:,} of {client['commands_sent']:,} commands answered")
-    report("picture")
+        progress.note(f"{client['commands_answered']:,} of {client['commands_sent']:,} commands answered")
+    progress("picture")
     touch = read_touch(recording, model)
     picture = out / "demo.png"
     draw_touch(model, touch, 0, picture)
@@ -126,31 +127,31 @@ def read_touch(recording: Path, model: ReducedModel) -> Touch:
     return Touch((heard - heard[0]) * model.period_s, applied, force, scale * exact)
 
 
-def _built(path: Path, config_path: Path, report: Report) -> ReducedModel:
+def _built(path: Path, config_path: Path, progress: Progress) -> ReducedModel:
     config = load_config(config_path)
     if path.exists():
         try:
             model = load_model(path)
         except ModelFileError as error:
-            report("look at the model that is there")
-            report.note(f"{error}; building it again")
+            progress("look at the model that is there")
+            progress.note(f"{error}; building it again")
         else:
             if model.config_sha256 == fingerprint(config, config_path.parent):
-                report(f"model {path}")
-                report.note("already built from this configuration")
+                progress(f"model {path}")
+                progress.note("already built from this configuration")
                 return model
-    model = build_model(config, config_path.parent, report)
+    model = build_model(config, config_path.parent, progress)
     save_model(model, path)
     return model
 
 
 @contextmanager
-def _server(model_path: Path, report: Report) -> Iterator[str]:
+def _server(model_path: Path, progress: Progress) -> Iterator[str]:
     """A server process on a free port of this machine, ended on the way out; gives its endpoint."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    report("server in a second process")
+    progress("server in a second process")
     command = [sys.executable, "-m", "palpate_server", str(model_path), "--listen", endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -158,7 +159,7 @@ def _server(model_path: Path, report: Report) -> Iterator[str]:
             first = process.stdout.readline().strip()
             if not first:
                 raise ValueError(f"the server did not start (exit code {process.wait(_STOP_TIMEOUT_S)})")
-            report.note(first)
+            progress.note(first)
             yield endpoint
         finally:
             process.terminate()

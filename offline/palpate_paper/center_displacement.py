@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.modes.dense import elastic_modes
 from palpate.scene.material import PronySeries
 from palpate_paper import finite_element_fields, membrane, spot_load
 from palpate_paper.convergence import DISC_SPOT
@@ -33,11 +34,12 @@ def center_displacement(study: Study) -> Figure:
         "exact": _at(0, *spot_load.disc_modes(origin, DISC_SPOT), len(times)),
         f"linear finite elements, {triangles} triangles": _at(center_of(mesh)[0], *elements, len(times)),
     }
-    for name, modes in (
-        ("PCMFS conservative", membrane.conservative_modes(cloud)),
-        ("PCMFS collocation, linear", membrane.collocation_modes(cloud, order=1)),
-        ("PCMFS collocation, quadratic", membrane.collocation_modes(cloud, order=2)),
+    for name, body in (
+        ("PCMFS conservative", membrane.conservative(cloud)),
+        ("PCMFS collocation, linear", membrane.collocation(cloud, order=1)),
+        ("PCMFS collocation, quadratic", membrane.collocation(cloud, order=2)),
     ):
+        modes = elastic_modes(body)
         load = spot_load.modal_load(modes.shapes, pressure)
         curve = _at(center_of(cloud)[0], modes.squared_frequencies, modes.shapes, load, len(times))
         curves[f"{name}, {cloud.n_nodes} nodes"] = curve

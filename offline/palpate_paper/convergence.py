@@ -13,6 +13,7 @@ from palpate.discretization import collocation, conservative
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.shapes import box_lattice
 from palpate.geometry.tributary import tributary_measures
+from palpate.modes.dense import elastic_modes
 from palpate.modes.elastic_modes import ElasticModes
 from palpate.scene.material import PronySeries
 from palpate_paper import finite_element_fields, membrane, membrane_frequencies, spot_load
@@ -197,11 +198,11 @@ def cube_errors(counts: Sequence[int], reference_elements: int) -> list[Error]:
         motion = np.zeros((len(top), 3))
         motion[:, 2] = _pressed_top(cloud.points[top, 0], cloud.points[top, 1])
         tips = [[int(i)] for i in top]
-        for method, elastic_modes in (
-            ("conservative", conservative.elastic_modes),
-            ("collocation, linear", collocation.elastic_modes),
+        for method, assemble in (
+            ("conservative", conservative.assemble),
+            ("collocation, linear", collocation.assemble),
         ):
-            modes = elastic_modes(cloud, CUBE_MATERIAL, fixed, tips)
+            modes = elastic_modes(assemble(cloud, CUBE_MATERIAL, fixed, tips))
             for i, omega in enumerate(omegas):
                 add(method, i, harmonic_field(modes, omega, motion.ravel()).reshape(-1, 3))
         for i, omega in enumerate(omegas):
@@ -231,9 +232,9 @@ def _pressed_top(x: Array, y: Array) -> Array:
 
 def _meshfree(cloud: Membrane) -> list[tuple[str, ElasticModes]]:
     return [
-        ("conservative", membrane.conservative_modes(cloud)),
-        ("collocation, linear", membrane.collocation_modes(cloud, order=1)),
-        ("collocation, quadratic", membrane.collocation_modes(cloud, order=2)),
+        ("conservative", elastic_modes(membrane.conservative(cloud))),
+        ("collocation, linear", elastic_modes(membrane.collocation(cloud, order=1))),
+        ("collocation, quadratic", elastic_modes(membrane.collocation(cloud, order=2))),
     ]
 
 

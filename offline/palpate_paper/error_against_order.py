@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from palpate.build import FullModel, build_full_model
-from palpate.cli import stage_reporter
 from palpate.lti.frequencies import all_frequencies, band_frequencies, spectral_norms
 from palpate.plots import require_matplotlib
 from palpate.reduction.methods import METHODS, reductions
@@ -130,10 +129,8 @@ def main() -> None:
     arguments = parser.parse_args()
     config = load_config(arguments.config)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    with stage_reporter() as report:
-        full = build_full_model(config, arguments.config.parent, report)
-        report("error against order, four methods")
-        rows = error_against_order(full, config.reduction.band_hz, note=report.note)
+    full = build_full_model(config, arguments.config.parent)
+    rows = error_against_order(full, config.reduction.band_hz, note=print)
     write_table(rows, arguments.out.with_suffix(".csv"))
     title = f"{config.name}: {full.cloud.n_nodes:,} nodes, {full.system.n_states:,} states in full"
     draw(rows, title, config.reduction.band_hz, arguments.out.with_suffix(".png"))

@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.discretization import collocation, conservative
+from palpate.discretization.assembled_body import AssembledBody
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.shapes import box_lattice
 from palpate.lti.pole_residue import DiagonalSystem
 from palpate.lti.viscoelastic import viscoelastic_system
+from palpate.modes.dense import elastic_modes
 from palpate.modes.elastic_modes import ElasticModes
 from palpate.scene.material import PRESETS, PronySeries
 from palpate_paper import membrane
 from palpate_paper.membranes import Membrane, disc_membrane, square_membrane
-from palpate_paper.time_integration import EquationsOfMotion
+from palpate_paper.time_integration import EquationsOfMotion, equations_of_motion
 
 Array = NDArray[np.float64]
 Discretization = Literal["conservative", "collocation"]
@@ -71,12 +73,13 @@ def disc(n_nodes: int = 500, discretization: Discretization = "conservative") ->
     """Section 4.1.1: elastic disc, everything 1, 600 of 800 states in the paper."""
     cloud = disc_membrane(n_nodes)
     tip = center_of(cloud)
-    modes = _membrane_modes(cloud, tip, discretization)
+    body = _membrane_body(cloud, tip, discretization)
+    modes = elastic_modes(body)
     order = round(0.75 * 2 * modes.n_modes / 2) * 2 if n_nodes < 400 else 600
     return Example(
         "disc",
         with_drag(modes, DISC_DRAG_PER_S),
-        _membrane_equations(cloud, tip, discretization),
+        equations_of_motion(body),
         PronySeries(),
         n_nodes,
         modes.n_modes,
@@ -92,12 +95,13 @@ def square(count: int = 15, discretization: Discretization = "conservative") -> 
     """Section 4.1.2: viscoelastic square, count² nodes; the paper has 200, and reduces 400 states to 200."""
     cloud = square_membrane(count**2)
     tip = center_of(cloud)
-    modes = _membrane_modes(cloud, tip, discretization)
+    body = _membrane_body(cloud, tip, discretization)
+    modes = elastic_modes(body)
     order = 200 if count >= 15 else modes.n_modes
     return Example(
         "square",
         viscoelastic_system(modes, SQUARE_PRONY),
-        _membrane_equations(cloud, tip, discretization),
+        equations_of_motion(body),
         SQUARE_PRONY,
         cloud.n_nodes,
         modes.n_modes,
@@ -115,8 +119,9 @@ def cube(nodes_an_edge: int = 10, discretization: Discretization = "conservative
     An even number of nodes an edge has no node in the middle: the four around it are the tip.
     """
     cloud, fixed, tip = cube_parts(nodes_an_edge)
-    space = conservative if discretization == "conservative" else collocation
-    modes = space.elastic_modes(cloud, CUBE_MATERIAL, fixed, [tip])
+    assemble = (conservative if discretization == "conservative" else collocation).assemble
+    body = assemble(cloud, CUBE_MATERIAL, fixed, [tip])
+    modes = elastic_modes(body)
     order = 300 if nodes_an_edge >= 10 else 100
     times = PERIOD_S * np.arange(5001)
     inputs = np.zeros((len(times), 3))
@@ -127,7 +132,7 @@ def cube(nodes_an_edge: int = 10, discretization: Discretization = "conservative
     return Example(
         "cube",
         viscoelastic_system(modes, CUBE_MATERIAL.prony),
-        space.equations_of_motion(cloud, CUBE_MATERIAL, fixed, [tip]),
+        equations_of_motion(body),
         CUBE_MATERIAL.prony,
         cloud.n_nodes,
         modes.n_modes,
@@ -196,13 +201,6 @@ def with_drag(modes: ElasticModes, drag_per_s: float) -> DiagonalSystem:
     )
 
 
-def _membrane_modes(cloud: Membrane, tip: list[int], discretization: Discretization) -> ElasticModes:
-    if discretization == "conservative":
-        return membrane.conservative_modes(cloud, [tip])
-    return membrane.collocation_modes(cloud, [tip])
-
-
-def _membrane_equations(cloud: Membrane, tip: list[int], discretization: Discretization) -> EquationsOfMotion:
-    if discretization == "conservative":
-        return membrane.conservative_equations(cloud, [tip])
-    return membrane.collocation_equations(cloud, [tip])
+def _membrane_body(cloud: Membrane, tip: list[int], discretization: Discretization) -> AssembledBody:
+    assemble = membrane.conservative if discretization == "conservative" else membrane.collocation
+    return assemble(cloud, [tip])

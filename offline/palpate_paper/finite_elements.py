@@ -115,12 +115,9 @@ def equations_of_motion(
     moving = np.ones(body.n_dofs)
     moving[prescribed] = 0.0
     keep = csr_array((moving, (np.arange(body.n_dofs),) * 2))
+    identity = csr_array(eye_array(body.n_dofs))
     return with_multipliers(
-        csr_array(keep @ body.mass @ keep),
-        body.stiffness,
-        csr_array(eye_array(body.n_dofs)),
-        prescribed,
-        selection,
+        csr_array(keep @ body.mass @ keep), body.stiffness, identity, identity, prescribed, selection
     )
 
 

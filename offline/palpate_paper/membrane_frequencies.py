@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import jn_zeros
 
+from palpate.discretization.assembled_body import AssembledBody
+from palpate.modes.dense import elastic_modes
 from palpate_paper import membrane
 from palpate_paper.finite_element_fields import require_scikit_fem
 from palpate_paper.membranes import Membrane, disc_membrane, square_membrane
@@ -95,20 +97,17 @@ def table(errors: Sequence[FrequencyErrors], exact: str) -> str:
 
 
 def _meshfree(clouds: Sequence[Membrane], exact: Array) -> list[FrequencyErrors]:
-    methods: dict[str, Callable[[Membrane], Array | NDArray[np.complex128]]] = {
-        "conservative": lambda cloud: membrane.conservative_modes(cloud).squared_frequencies,
-        "collocation, quadratic": lambda cloud: membrane.collocation_modes(cloud).squared_frequencies,
-    }
+    assemble = {"conservative": membrane.conservative, "collocation, quadratic": membrane.collocation}
     return [
-        _errors(
-            name,
-            {
-                c.n_nodes: np.sort(np.sqrt(squared_frequencies(c)[:COUNT].astype(complex)).real) / exact - 1
-                for c in clouds
-            },
-        )
-        for name, squared_frequencies in methods.items()
+        _errors(name, {cloud.n_nodes: _frequencies(body(cloud)) / exact - 1 for cloud in clouds})
+        for name, body in assemble.items()
     ]
+
+
+def _frequencies(body: AssembledBody) -> Array:
+    """(COUNT,), rad/s, ascending: the lowest."""
+    lowest = elastic_modes(body).squared_frequencies[:COUNT]
+    return np.sort(np.sqrt(lowest.astype(np.complex128)).real)
 
 
 def _errors(method: str, by_nodes: dict[int, Array]) -> FrequencyErrors:

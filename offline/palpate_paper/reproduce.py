@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
 
 from palpate.plots import require_matplotlib
+from palpate.progress import NO_PROGRESS, Progress
 from palpate_paper import convergence, discretizations, errors_and_times, frequency_responses, orders
 from palpate_paper.center_displacement import center_displacement
 from palpate_paper.figure import Figure
@@ -34,14 +34,9 @@ FIGURES: dict[int, Callable[[Study], Figure]] = {
 """Those of the paper by its numbers (figure 1 is a sketch), then ours."""
 
 
-class Report(Protocol):
-    """Progress: called with the name of each stage; `note` says what it is at."""
-
-    def __call__(self, name: str) -> None: ...
-    def note(self, text: str) -> None: ...
-
-
-def reproduce(numbers: Sequence[int], out: Path, quick: bool, report: Report) -> list[Path]:
+def reproduce(
+    numbers: Sequence[int], out: Path, quick: bool = False, progress: Progress = NO_PROGRESS
+) -> list[Path]:
     """Plot and table of each figure in OUT/images/paper and, when all are drawn, the page OUT/paper.md.
 
     numbers  of the figures; empty for all
@@ -56,13 +51,13 @@ def reproduce(numbers: Sequence[int], out: Path, quick: bool, report: Report) ->
     require_matplotlib()
     images = out / "images" / "paper"
     images.mkdir(parents=True, exist_ok=True)
-    study = Study(quick, report.note)
+    study = Study(quick, progress.note)
     figures, written = [], []
     for number in sorted(set(numbers) or FIGURES):
-        report(f"figure {number}")
+        progress(f"figure {number}")
         figure = FIGURES[number](study)
         figure.write(images)
-        report.note(figure.title)
+        progress.note(figure.title)
         figures.append(figure)
         written.append(images / f"{figure.stem}.png")
     if len(figures) == len(FIGURES):

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.build import build_cloud
-from palpate.discretization.statics import static_stiffness
-from palpate.geometry.regions import PlaneRegion, contact_patch, nodes_in
-from palpate.scene import schema as config_tables
+from palpate.discretization import conservative
 from palpate.scene.schema import load_config
+from palpate.scene_cloud import build_cloud, contact_patches, fixed_nodes
+from palpate_paper.static_stiffness import static_stiffness
 
 LIVER = Path(__file__).parents[2] / "configs" / "liver.toml"
 
@@ -23,11 +22,9 @@ def test_the_patch_is_several_nodes_across_and_the_tip_no_stiffer_than_a_bonded_
     material = config.material.material()
     cloud = build_cloud(config, LIVER.parent)
     (tip,) = config.contact
-    (back,) = config.fixed
-    assert isinstance(back, config_tables.PlaneRegion)
-    patch = contact_patch(tip.point_m, tip.radius_m, cloud)
-    fixed = nodes_in(PlaneRegion(back.point_m, back.normal), cloud)
-    stiffness = static_stiffness(cloud, material, fixed, [patch.nodes])
+    fixed = fixed_nodes(config, cloud)
+    (patch,) = contact_patches(config, cloud, fixed)
+    stiffness = static_stiffness(conservative.assemble(cloud, material, fixed, [patch.nodes]))
     nu = material.poissons_ratio
     half_space = 4 * np.log(3 - 4 * nu) / (1 - 2 * nu) * material.shear_modulus_pa * tip.radius_m
     assert cloud.n_nodes >= 1000

@@ -12,6 +12,7 @@ import pytest
 from scipy.integrate import dblquad, solve_ivp
 
 from palpate.lti.frequencies import all_frequencies, spectral_norms
+from palpate.modes.dense import elastic_modes
 from palpate.scene.material import PronySeries
 from palpate_paper import convergence, finite_elements, membrane, membrane_frequencies, orders, spot_load
 from palpate_paper.examples import (
@@ -106,7 +107,7 @@ def test_the_series_of_the_square_satisfies_the_boundary_and_has_the_spots_mean(
 
 def test_drag_adds_c_s_to_every_mode() -> None:
     cloud = disc_membrane(60)
-    modes = membrane.conservative_modes(cloud, [center_of(cloud)])
+    modes = elastic_modes(membrane.conservative(cloud, [center_of(cloud)]))
     system = with_drag(modes, 0.3)
     s = np.array([0.1 + 2j, 3j, 1.0])
     b = modes.input_coupling[:, 0]

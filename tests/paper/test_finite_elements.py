@@ -9,11 +9,11 @@ from scipy.special import jn_zeros
 
 from palpate.discretization import conservative
 from palpate.geometry.shapes import box_lattice
+from palpate.modes.dense import elastic_modes
 from palpate.scene.material import Material, PronySeries
-from palpate_paper import finite_elements
-from palpate_paper.membrane import conservative_modes
+from palpate_paper import finite_elements, membrane
 from palpate_paper.membranes import disc_membrane, square_membrane
-from palpate_paper.time_integration import newmark
+from palpate_paper.time_integration import equations_of_motion, newmark
 
 DISC = np.sort(np.concatenate([np.repeat(jn_zeros(m, 6), 1 if m == 0 else 2) for m in range(12)]))[:6]
 SQUARE = np.sort([np.pi * np.hypot(m, n) for m in range(1, 9) for n in range(1, 9)])[:6]
@@ -80,7 +80,8 @@ def test_the_conservative_cube_pushed_by_a_patch_moves_as_finite_elements_do():
 
     times = 0.1 * np.arange(101)
     inputs = np.outer(np.sin(np.pi * np.minimum(times / 10, 1)) ** 2, [0, 0, 1.0])
-    meshfree = conservative.equations_of_motion(cloud, CUBE, bottom, [np.flatnonzero(pressed(cloud.points))])
+    pushed = [np.flatnonzero(pressed(cloud.points))]
+    meshfree = equations_of_motion(conservative.assemble(cloud, CUBE, bottom, pushed))
     body = finite_elements.cube(6, CUBE, degree=2)
     tip = [np.flatnonzero(pressed(body.places) & (body.components == k)) for k in range(3)]
     elements = finite_elements.equations_of_motion(body, body.at(lambda x: x[:, 2] < 1e-9), [tip])
@@ -98,7 +99,7 @@ def test_the_conservative_cube_pushed_by_a_patch_moves_as_finite_elements_do():
 )
 def test_the_conservative_membrane_beats_linear_triangles_with_as_many_nodes(body, on_edge, cloud, reference):
     theirs = np.abs(finite_elements.frequencies(body, body.at(on_edge), 6) / reference - 1).max()
-    modes = conservative_modes(cloud(body.n_dofs))
+    modes = elastic_modes(membrane.conservative(cloud(body.n_dofs)))
     ours = np.abs(np.sqrt(modes.squared_frequencies[:6]) / reference - 1).max()
     assert ours < theirs / 2
 

@@ -1,15 +1,19 @@
 """Newmark's method against the exact response of the linear time-invariant system, and against statics."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from palpate.discretization import collocation, conservative
+from palpate.discretization.supports import supports
 from palpate.geometry.shapes import box_lattice
 from palpate.lti.viscoelastic import viscoelastic_system
+from palpate.modes.dense import elastic_modes, nodal_stiffness
 from palpate.scene.material import Material, PronySeries
 from palpate_paper import membrane
 from palpate_paper.membranes import disc_membrane
-from palpate_paper.time_integration import newmark
+from palpate_paper.time_integration import equations_of_motion, newmark
 
 PRONY = PronySeries((0.8, 0.5), (1.0, 0.1))
 
@@ -20,21 +24,20 @@ def _cube(method):
     tip = np.flatnonzero(
         (cloud.points[:, 2] == 1) & (np.linalg.norm(cloud.points[:, :2] - 0.5, axis=1) < 0.3)
     )
-    arguments = (cloud, Material(1.0, 0.3, 0.1, PRONY), bottom, [tip])
-    return method.elastic_modes(*arguments), method.equations_of_motion(*arguments), 3 * tip[0] + 2
+    body = method.assemble(cloud, Material(1.0, 0.3, 0.1, PRONY), bottom, [tip])
+    return elastic_modes(body), equations_of_motion(body), 3 * tip[0] + 2
 
 
 def _disc(method):
-    disc = disc_membrane(61)
-    modes = getattr(membrane, f"{method}_modes")(disc, [[0]])
-    return modes, getattr(membrane, f"{method}_equations")(disc, [[0]]), 0
+    body = method(disc_membrane(61), [[0]])
+    return elastic_modes(body), equations_of_motion(body), 0
 
 
 MODELS = {
     "conservative cube": lambda: _cube(conservative),
     "collocated cube": lambda: _cube(collocation),
-    "conservative disc": lambda: _disc("conservative"),
-    "collocated disc": lambda: _disc("collocation"),
+    "conservative disc": lambda: _disc(membrane.conservative),
+    "collocated disc": lambda: _disc(membrane.collocation),
 }
 
 
@@ -86,12 +89,13 @@ def test_observed_tip_nodes_follow_the_input_exactly(model):
 
 def test_without_a_prony_series_the_conservative_model_conserves_energy_when_the_tip_rests():
     disc = disc_membrane(61)
-    equations = membrane.conservative_equations(disc, [[0]])
+    body = membrane.conservative(disc, [[0]])
+    equations = equations_of_motion(body)
     step, n = 0.01, 600
     times = step * np.arange(n)
     inputs = 0.1 * np.sin(np.pi * np.minimum(times, 0.5) / 0.5)[:, None] ** 4
     u = newmark(equations, PronySeries(), inputs, step, observed=np.arange(disc.n_nodes)).displacements
-    stiffness = membrane.conservative_stiffness(disc)
+    stiffness = nodal_stiffness(replace(body, supports=supports(disc.n_nodes, [], [])))
     velocity = (u[2:] - u[:-2]) / (2 * step)
     potential = 0.5 * np.einsum("ti,ij,tj->t", u[1:-1], stiffness, u[1:-1])
     kinetic = 0.5 * velocity**2 @ disc.areas

@@ -1,1 +1,1 @@
-"""Discretizations of linear elasticity on a node cloud: the conservative one for organs, the paper's for comparison."""
+"""Discretizations of linear elasticity on a node cloud; they assemble, and solve nothing."""

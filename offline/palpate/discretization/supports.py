@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, eye_array, hstack
+
+from palpate.geometry.cloud import NodeCloud
 
 Indices = NDArray[np.int64]
 
@@ -40,9 +42,10 @@ class Supports:
         return csr_array((np.ones(len(nodes)), (nodes, patch)), shape=(self.n_nodes, len(self.contacts)))
 
     @property
-    def patch_shapes(self) -> NDArray[np.float64]:
-        """(3 n_nodes, 3 n_contacts), m per m: the displacement field of each tip component alone, zero off the patches."""
-        return np.kron(self.tips.toarray(), np.eye(3))
+    def kinematics(self) -> csr_array:
+        """(n_nodes, n_free + n_contacts): nodal values from the values of the free nodes and of the tips."""
+        free = eye_array(self.n_nodes, format="csr")[:, self.free]
+        return csr_array(hstack([free, self.tips]))
 
 
 def supports(n_nodes: int, fixed: ArrayLike, contacts: Sequence[ArrayLike]) -> Supports:
@@ -83,3 +86,13 @@ def supports(n_nodes: int, fixed: ArrayLike, contacts: Sequence[ArrayLike]) -> S
 def components(nodes: Indices, n: int) -> Indices:
     """(n len(nodes),): the indices of the nodes' n components each, where those of node 0 come first."""
     return (n * nodes[:, None] + np.arange(n)).ravel()
+
+
+def require_volumes(cloud: NodeCloud) -> None:
+    """Raises ValueError naming the first node that stands for no volume."""
+    bad = np.flatnonzero(~(cloud.volumes > 0))
+    if len(bad):
+        raise ValueError(
+            f"node {bad[0]} has volume {cloud.volumes[bad[0]]} m³: expected above 0 "
+            "(two nodes at the same place, or one outside the body)"
+        )

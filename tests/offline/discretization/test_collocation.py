@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from palpate.discretization import collocation
-from palpate.discretization.nodal import NodalValues
-from palpate.discretization.stability import stability
 from palpate.geometry.shapes import ball, box_lattice
+from palpate.modes.dense import elastic_modes, nodal_stiffness
 from palpate.scene.material import PRESETS, PronySeries
+from palpate_paper.stability import stability
 
 EPS = np.finfo(float).eps
 CUBE = PRESETS["paper-cube"]
@@ -36,12 +36,12 @@ def _top_center(cloud):
 
 def _rows(cloud):
     """Functions of node indices: the rows of momentum and of traction, acting on nodal values."""
-    operators = collocation.Operators(cloud, CUBE, 2.2)
-    values = NodalValues(operators.h.value)
-    return (
-        lambda nodes: values.vector_operator(operators.divergence_of_stress(nodes)),
-        lambda nodes: values.vector_operator(operators.traction(nodes)),
-    )
+    force = nodal_stiffness(collocation.assemble(cloud, CUBE, [], [])).reshape(cloud.n_nodes, 3, -1)
+
+    def rows(measure, nodes):
+        return (force[nodes] / measure[nodes, None, None]).reshape(3 * len(nodes), -1)
+
+    return lambda nodes: -rows(cloud.volumes, nodes), lambda nodes: rows(cloud.areas, nodes)
 
 
 def test_linear_fields_have_exact_tractions_and_no_body_force_and_rigid_motions_have_neither(cloud):
@@ -75,7 +75,7 @@ def test_the_patch_test_is_solved_exactly(cloud):
 def test_modes_satisfy_momentum_inside_and_zero_traction_on_the_free_surface():
     cloud, bottom = _cube(6, 0.1)
     tip = _top_center(cloud)
-    modes = collocation.elastic_modes(cloud, CUBE, bottom, [tip])
+    modes = elastic_modes(collocation.assemble(cloud, CUBE, bottom, [tip]))
     divergence_of_stress, traction_rows = _rows(cloud)
     held = np.concatenate([bottom, tip])
     surface = np.setdiff1d(np.flatnonzero(cloud.boundary), held)
@@ -97,7 +97,7 @@ def test_modes_satisfy_momentum_inside_and_zero_traction_on_the_free_surface():
 def test_the_static_force_is_the_traction_of_the_static_solution_times_its_area():
     cloud, bottom = _cube(6, 0.1)
     tip = _top_center(cloud)
-    modes = collocation.elastic_modes(cloud, CUBE, bottom, [tip])
+    modes = elastic_modes(collocation.assemble(cloud, CUBE, bottom, [tip]))
     divergence_of_stress, traction_rows = _rows(cloud)
     # All rows at once, nothing eliminated.
     inside = np.flatnonzero(~cloud.boundary)
@@ -116,7 +116,7 @@ def test_the_static_force_is_the_traction_of_the_static_solution_times_its_area(
 def test_all_poles_of_the_papers_cube_are_in_the_left_half_plane(tip):
     cloud, bottom = _cube(10)
     contacts = {"one node": [_top_center(cloud)[:1]], "four nodes": [_top_center(cloud)]}[tip]
-    modes = collocation.elastic_modes(cloud, CUBE, bottom, contacts)
+    modes = elastic_modes(collocation.assemble(cloud, CUBE, bottom, contacts))
     judged = stability(modes, CUBE.prony)
     assert judged.growing_modes == 0
     assert judged.spectral_abscissa_per_s < 0
@@ -128,7 +128,7 @@ def test_all_poles_of_the_papers_cube_are_in_the_left_half_plane(tip):
 
 def test_complex_modes_come_in_conjugate_pairs_ascending_in_size():
     cloud, bottom = _cube(7, 0.2)
-    modes = collocation.elastic_modes(cloud, CUBE, bottom, [_top_center(cloud)])
+    modes = elastic_modes(collocation.assemble(cloud, CUBE, bottom, [_top_center(cloud)]))
     mu = modes.squared_frequencies
     assert np.all(np.diff(np.abs(mu)) >= 0)
     np.testing.assert_allclose(np.sort_complex(mu), np.sort_complex(mu.conj()), rtol=1e-9)
@@ -161,4 +161,4 @@ def test_a_patch_node_inside_the_body_is_refused_by_name():
     cloud, bottom = _cube(5)
     inside = np.flatnonzero(~cloud.boundary)[0]
     with pytest.raises(ValueError, match=rf"contacts\[0\] holds node {inside}, which is not on the boundary"):
-        collocation.elastic_modes(cloud, CUBE, bottom, [[inside]])
+        collocation.assemble(cloud, CUBE, bottom, [[inside]])

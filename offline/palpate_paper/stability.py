@@ -1,4 +1,4 @@
-"""Whether the modes of an assembled model decay, and how much damping would make them."""
+"""Whether the modes of a discretization decay, and how much damping would make them."""
 
 from __future__ import annotations
 

@@ -5,15 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.build import build_cloud
 from palpate.discretization import conservative
-from palpate.discretization.statics import static_stiffness
 from palpate.geometry.fill import fill_surface
-from palpate.geometry.regions import PlaneRegion, contact_patch, nodes_in
+from palpate.geometry.regions import contact_patch
 from palpate.geometry.shapes import box_lattice, box_surface
 from palpate.geometry.spacing import Refinement
+from palpate.modes.dense import elastic_modes
 from palpate.scene.material import Material
 from palpate.scene.schema import load_config
+from palpate.scene_cloud import build_cloud, contact_patches, fixed_nodes
+from palpate_paper.static_stiffness import static_stiffness
 
 
 def test_statics_without_modes_equal_statics_with_them():
@@ -25,15 +26,16 @@ def test_statics_without_modes_equal_statics_with_them():
         np.flatnonzero(top & (cloud.points[:, 0] < 0.4)),
         np.flatnonzero(top & (cloud.points[:, 0] > 0.8)),
     ]
-    with_modes = conservative.elastic_modes(cloud, material, bottom, patches).static_stiffness
-    without = static_stiffness(cloud, material, bottom, patches)
+    body = conservative.assemble(cloud, material, bottom, patches)
+    with_modes, without = elastic_modes(body).static_stiffness, static_stiffness(body)
     np.testing.assert_allclose(without, with_modes, atol=1e-9 * np.abs(with_modes).max())
 
 
 def test_a_body_that_nothing_holds_follows_its_tip_without_force():
     cloud = box_lattice((0, 0, 0), (1, 1, 1), (6, 6, 6), 0.2, seed=3)
     tip = np.flatnonzero(cloud.points[:, 2] == 1)
-    np.testing.assert_allclose(static_stiffness(cloud, Material(2.0, 0.45, 1.0), [], [tip]), 0, atol=1e-9)
+    body = conservative.assemble(cloud, Material(2.0, 0.45, 1.0), [], [tip])
+    np.testing.assert_allclose(static_stiffness(body), 0, atol=1e-9)
 
 
 POISSONS_RATIO = 0.49
@@ -54,7 +56,7 @@ def _punch_stiffness(spacing, growth):
     held = np.flatnonzero((x[:, 0] > r - 1e-6) | (x[:, 1] > r - 1e-6) | (x[:, 2] > r - 1e-6))
     patch = contact_patch((0.0, 0.0, 0.0), 1.0, cloud)
     material = Material(2 * (1 + POISSONS_RATIO), POISSONS_RATIO, 1.0)
-    return static_stiffness(cloud, material, held, [patch.nodes])[2, 2]
+    return static_stiffness(conservative.assemble(cloud, material, held, [patch.nodes]))[2, 2]
 
 
 @pytest.fixture(scope="module")
@@ -84,14 +86,16 @@ def test_the_livers_tip_stiffness_changes_by_less_than_five_percent_when_the_spa
     folder = Path(__file__).parents[3] / "configs"
     config = load_config(folder / "liver.toml")
     (tip,) = config.contact
-    (region,) = config.fixed
     stiffness = []
     for spacing in (tip.spacing_m, tip.spacing_m / 2):
         contact = tip.model_copy(update={"spacing_m": spacing})
-        cloud = build_cloud(config.model_copy(update={"contact": [contact]}), folder)
-        patch = contact_patch(tip.point_m, tip.radius_m, cloud)
-        held = nodes_in(PlaneRegion(region.point_m, region.normal), cloud)
-        stiffness.append(static_stiffness(cloud, config.material.material(), held, [patch.nodes]))
+        scene = config.model_copy(update={"contact": [contact]})
+        cloud = build_cloud(scene, folder)
+        held = fixed_nodes(scene, cloud)
+        patches = [p.nodes for p in contact_patches(scene, cloud, held)]
+        stiffness.append(
+            static_stiffness(conservative.assemble(cloud, scene.material.material(), held, patches))
+        )
     coarse, fine = stiffness
     np.testing.assert_allclose(np.linalg.eigvalsh(coarse), np.linalg.eigvalsh(fine), rtol=0.05)
     assert np.linalg.norm(coarse - fine, 2) < 0.05 * np.linalg.norm(fine, 2)

@@ -1,0 +1,26 @@
+"""How a long computation says where it is."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """Called with the name of each stage as it begins."""
+
+    def __call__(self, stage: str, /) -> None: ...
+
+    def note(self, text: str) -> None:
+        """The result of the stage so far, in a few words."""
+
+
+class _NoProgress:
+    def __call__(self, stage: str) -> None:
+        pass
+
+    def note(self, text: str) -> None:
+        pass
+
+
+NO_PROGRESS: Progress = _NoProgress()
+"""Shows nothing."""
