@@ -75,7 +75,7 @@ def disc(study: Study) -> Figure:
     )
     study.note("disc: frequencies")
     more = membrane_frequencies.table(membrane_frequencies.disc(study.quick), "Bessel zeros")
-    return _figure(3, "Disc: convergence of the deflection in L2", errors, 2, _MEMBRANE_FINDINGS, more)
+    return convergence_figure(3, "Disc: convergence of the deflection in L2", errors, 2, _MEMBRANE_FINDINGS, more)
 
 
 def square(study: Study) -> Figure:
@@ -92,7 +92,7 @@ def square(study: Study) -> Figure:
         f"{_MEMBRANE_FINDINGS}Scattered: root mean squares over {n_seeds} clouds, the lattice's inner nodes moved by up to "
         "a fifth of the spacing."
     )
-    return _figure(6, "Square: convergence of the deflection in L2", errors, 2, findings, more)
+    return convergence_figure(6, "Square: convergence of the deflection in L2", errors, 2, findings, more)
 
 
 def scattered_square_errors(lattices: Sequence[Membrane], n_seeds: int) -> list[Error]:
@@ -132,7 +132,7 @@ def cube(study: Study) -> Figure:
     study.note("cube: convergence")
     counts = (4, 5, 6) if study.quick else (5, 7, 9, 11)
     errors = cube_errors(counts, 6 if study.quick else 10)
-    return _figure(9, "Cube: convergence of the displacement in L2", errors, 3, _CUBE_FINDINGS)
+    return convergence_figure(9, "Cube: convergence of the displacement in L2", errors, 3, _CUBE_FINDINGS)
 
 
 def membrane_errors(
@@ -273,7 +273,7 @@ class Orders:
         )
 
 
-def _figure(
+def convergence_figure(
     number: int, title: str, errors: list[Error], dimensions: int, findings: str, more: str = ""
 ) -> Figure:
     methods = list(dict.fromkeys(e.method for e in errors))

@@ -115,7 +115,7 @@ def error_against_order(study: Study) -> Figure:
         _smallest_orders(measured, examples),
         (11.0, 9.0),
         f"Fewest states for {per_cent(_GOOD_ENOUGH)}, by the order asked for: "
-        + "; ".join(f"{e.name} {_fewest_states(measured, e)}" for e in examples)
+        + "; ".join(f"{e.name} {fewest_states(measured, e)}" for e in examples)
         + ".",
     )
 
@@ -200,7 +200,7 @@ def _smallest_orders(measured: Sequence[Point], examples: Sequence[Example]) -> 
             cells.append(" / ".join("—" if p is None else str(p.order) for p in found))
         lines.append(f"| {method.label} | " + " | ".join(cells) + " |")
     lines.append("")
-    lines += [f"- Fewest states asked for, {e.name}: {_fewest_states(measured, e)}." for e in examples]
+    lines += [f"- Fewest states asked for, {e.name}: {fewest_states(measured, e)}." for e in examples]
     lines.append(
         "\nThis plot decides: where the motion is known to stay in a band, as a hand's does, band-limited truncation; where a bound "
         "over all frequencies is wanted, TBR or HOM, and singular perturbation balancing if the statics must be exact, too."
@@ -208,7 +208,7 @@ def _smallest_orders(measured: Sequence[Point], examples: Sequence[Example]) -> 
     return "\n".join(lines)
 
 
-def _fewest_states(measured: Sequence[Point], example: Example) -> str:
+def fewest_states(measured: Sequence[Point], example: Example) -> str:
     """Which methods reach 2 % with the fewest states asked for, all of them, for each of the errors."""
     parts = []
     for field, where in (

@@ -219,13 +219,13 @@ def test_accuracies_are_compared_on_the_same_nodes_and_in_the_same_variant() -> 
         }.items()
         for n, value in zip((100, 400), values, strict=True)
     ]
-    said = convergence._figure(3, "Disc: any", errors, 2, "").findings
+    said = convergence.convergence_figure(3, "Disc: any", errors, 2, "").findings
     assert "collocation, linear is less accurate at every number of nodes (3 to 4 times the error)" in said
     assert "collocation, linear, scattered is less accurate at every number of nodes (3 to 9 times" in said
     assert "That confirms the paper's finding, for its own method" in said
     assert "is more accurate at 1 of 2 numbers of nodes (2 times the error at the coarsest, 0.5 times" in said
     # The text of the paper ranks the accuracies in figure 3 alone.
-    assert "finding" not in convergence._figure(6, "Square: any", errors, 2, "").findings
+    assert "finding" not in convergence.convergence_figure(6, "Square: any", errors, 2, "").findings
 
 
 def test_the_membranes_frequencies_converge_at_second_order() -> None:
@@ -307,5 +307,5 @@ def test_methods_that_need_equally_many_states_share_the_first_place(study: Stud
         point(TBR, 20, 20, 0.001),
         point(MT, 20, 18, 0.5),
     ]
-    said = orders._fewest_states(measured, study.square)
+    said = orders.fewest_states(measured, study.square)
     assert said.startswith("over all frequencies HOM = TBR (20), ")
