@@ -75,7 +75,9 @@ def disc(study: Study) -> Figure:
     )
     study.note("disc: frequencies")
     more = membrane_frequencies.table(membrane_frequencies.disc(study.quick), "Bessel zeros")
-    return convergence_figure(3, "Disc: convergence of the deflection in L2", errors, 2, _MEMBRANE_FINDINGS, more)
+    return convergence_figure(
+        3, "Disc: convergence of the deflection in L2", errors, 2, _MEMBRANE_FINDINGS, more
+    )
 
 
 def square(study: Study) -> Figure:
