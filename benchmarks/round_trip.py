@@ -38,18 +38,18 @@ def main() -> None:
         if options.model is None:
             save_model(spring_mass_model(n_modes=50), path)
         model = load_model(path)
-        contact = model.contacts[0].name
+        tool = model.contacts[0].name
         n = len(model.contacts)
         force_bytes = len(wire.ForceEncoder(n).encode(0, 0, np.zeros((n, 4), np.int64), np.zeros((n, 8))))
-        command_bytes = len(encode_command(contact, 10**6, 10**15))
+        command_bytes = len(encode_command(tool, 10**6, 10**15, (0.1, 0.2, 0.3)))
         print(
-            f"order {model.order}, {len(model.contacts)} contacts; "
+            f"order {model.order}, {n} tools; "
             f"command {command_bytes} bytes, force {force_bytes} bytes, {RATE_HZ} Hz"
         )
         bare, palpate = [], []
         for run in range(options.runs):
             bare.append(ping_pong(command_bytes, force_bytes, options.seconds))
-            palpate.append(through_a_model(path, contact, options.seconds, viewer=False)[0])
+            palpate.append(through_a_model(path, tool, options.seconds, viewer=False)[0])
             print(f"run {run}: ping/pong {describe(bare[-1])}; palpate {describe(palpate[-1])}", flush=True)
         for name in ("p50_s", "p99_s"):
             b, p = (statistics.median(getattr(r, name) for r in results) for results in (bare, palpate))

@@ -21,20 +21,19 @@ import time
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
 import psutil
 
 from palpate.model_file import load_model, save_model
-from palpate_client import wire
-from palpate_server.diagnostics.round_trips import free_endpoint
+from palpate_client import Connection, Surface
+from palpate_client.local_server import free_endpoint, running
+from palpate_client.wire import Keys
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.realtime import shared_memory
 from palpate_server.realtime.safety import Limits
 from palpate_server.session import transport
 from palpate_server.session.server import Server, ServerOptions
 
-CLIENT = Path(__file__).parents[1] / "client_examples" / "headless_client.py"
 SAMPLE_S = 10.0
 REPORT_S = 300.0
 
@@ -54,20 +53,11 @@ def main() -> None:
         if options.model is None:
             save_model(spring_mass_model(n_modes=50), path)
         endpoint, out = free_endpoint(), Path(folder) / "histograms.npz"
-        server = subprocess.Popen(
-            [sys.executable, __file__, str(path), "--serve", endpoint, str(out)],
-            stdout=subprocess.PIPE,
-            text=True,
-            env=os.environ
-            | {"OPENBLAS_NUM_THREADS": "1"},  # as `palpate serve` does: a pool of them would spin
-        )
-        try:
-            assert server.stdout is not None
-            assert server.stdout.readline().startswith("serving")
+        # As `palpate serve` does: a pool of BLAS threads would spin.
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"
+        command = [sys.executable, __file__, str(path), "--serve", endpoint, str(out)]
+        with running(command, "serving") as (server, _):
             memory = run(server.pid, endpoint, options.seconds)
-        finally:
-            server.terminate()
-            server.wait(10)
         if options.picture:
             with np.load(out) as file:
                 draw(file["histograms"], file["longest_ns"], memory, options.picture)
@@ -80,7 +70,7 @@ def serve(path: Path, endpoint: str, out: Path) -> None:
     limits = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
     with transport.open_session(endpoint, None) as session:
         options = ServerOptions(limits, path.parent, surface_hz=60.0)
-        server = Server(load_model(path), session, wire.Keys("main"), options)
+        server = Server(load_model(path), session, Keys(), options)
         server.start()
         print("serving", flush=True)
         while not stop.wait(0.1):
@@ -94,18 +84,19 @@ def run(server: int, endpoint: str, seconds: float) -> list[tuple[float, float]]
     statuses: list[dict[str, Any]] = []
     memory: list[tuple[float, float]] = []
     surfaces = 0
-    command = [sys.executable, str(CLIENT), "--connect", endpoint, "--json", "--duration-s", str(seconds)]
-    with transport.connect_session(endpoint, None) as session:
+    command = [sys.executable, "-m", "palpate_client.poke", "--connect", endpoint, "--json"]
+    command += ["--duration-s", str(seconds)]
+    with Connection(endpoint) as connection:
 
-        def keep_newest(sample: Any) -> None:
-            statuses[:] = [msgpack.unpackb(sample.payload.to_bytes())]
+        def keep_newest(status: dict[str, Any]) -> None:
+            statuses[:] = [status]
 
-        def count(sample: Any) -> None:
+        def count(surface: Surface) -> None:
             nonlocal surfaces
             surfaces += 1
 
-        session.declare_subscriber(wire.Keys("main").status, keep_newest)
-        session.declare_subscriber(wire.Keys("main").surface, count)
+        connection.on_status(keep_newest)
+        connection.on_surface(count)
         client = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         done = threading.Event()
         start = time.monotonic()
@@ -127,7 +118,7 @@ def run(server: int, endpoint: str, seconds: float) -> list[tuple[float, float]]
         watcher.start()
         try:
             out, _ = client.communicate(timeout=seconds + 60)
-            time.sleep(0.3)  # until a status has the last command
+            time.sleep(0.3)  # until a status counts the last command
         finally:
             client.kill()
             done.set()

@@ -334,10 +334,14 @@ def _configuration(endpoint: str, zenoh_config: str | Path | None) -> zenoh.Conf
         "connect/endpoints": [endpoint],
         "connect/timeout_ms": 2000,
         "connect/exit_on_failure": True,
+        # After a loss of the link: try again soon.
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+        "transport/unicast/open_timeout": 2000,
         # The server's place is known; scouting would only find others.
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": wire.LEASE_MS,
+        "transport/link/tx/keep_alive": wire.KEEP_ALIVES,
     }.items():
         config.insert_json5(key, json.dumps(value))
     return config

@@ -7,13 +7,13 @@ from array import array
 from typing import Any
 
 from palpate_client.messages import Description, Force
-from palpate_client.wire import Flags
+from palpate_client.wire import LEASE_MS, Flags
 
 ROUNDING_N = 1e-9
 REMEMBERED = 10_000  # commands: an answer to an older one breaks the contract anyway
 # A busy machine or network may delay commands until the force has faded. The flags tell, and nobody has promised to prevent
 # it. Zenoh closes a link on which nothing moves for this long, so a longer silence has another cause.
-UNHEARD_NS = 1_000_000_000
+UNHEARD_NS = LEASE_MS * 1_000_000
 MOST_BREAKS_TOLD = 20  # one cause can break every tick; the first ones tell
 
 
@@ -113,7 +113,7 @@ class Contract:
             self._lose(
                 force,
                 "we no longer hold the tool, our commands are forgotten: it was released or taken back "
-                "(after a second of silence, for instance), or the server has stopped or was started again",
+                "(after a long silence, for instance), or the server has stopped or was started again",
             )
             return False
         return True

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 import zenoh
@@ -19,10 +20,10 @@ from palpate_client.errors import ClientError
 PATIENCE_S = 2.0  # a status comes ten times a second
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="palpate health", description=(__doc__ or "").splitlines()[0])
     add_connection_options(parser, name=False)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     zenoh.init_log_from_env_or("off")  # what matters is said below
     try:
         with connection_for(options) as connection:

@@ -153,35 +153,36 @@ class Surface:
 def decode_geometry(payload: bytes) -> Geometry:
     """Raises wire.MalformedMessage."""
     message = wire.unpack(payload, wire.Kind.GEOMETRY)
-    vertices = _little_endian("f", _bytes(message, "vertices_m"))
-    triangles = _little_endian("i", _bytes(message, "triangles"))
-    if (len(vertices), len(triangles)) != (
-        3 * message.get("n_vertices", 0),
-        3 * message.get("n_triangles", 0),
-    ):
-        raise wire.MalformedMessage("wrong_shape", "n_vertices or n_triangles is not what the bytes hold")
+    vertices = _numbers(message, "vertices_m", "f", "n_vertices")
+    triangles = _numbers(message, "triangles", "i", "n_triangles")
     return Geometry(vertices, triangles)
 
 
 def decode_surface(payload: bytes) -> Surface:
     """Raises wire.MalformedMessage."""
     message = wire.unpack(payload, wire.Kind.SURFACE)
-    displacement = _little_endian("f", _bytes(message, "displacement_m"))
+    displacement = _numbers(message, "displacement_m", "f")
     try:
         return Surface(message["tick"], message["server_time_ns"], displacement)
     except KeyError as error:
         raise wire.MalformedMessage("missing_field", f"{error.args[0]} is missing") from None
 
 
-def _bytes(message: Mapping[str, Any], field: str) -> bytes:
+def _numbers(
+    message: Mapping[str, Any], field: str, typecode: str, rows_field: str | None = None
+) -> array[Any]:
+    """The little-endian numbers of a field, three a row; rows_field says how many rows there are."""
     value = message.get(field)
     if not isinstance(value, bytes) or len(value) % 12:
-        raise wire.MalformedMessage("wrong_type", f"{field}: expected bytes, three numbers of 4 for each row")
-    return value
-
-
-def _little_endian(typecode: str, data: bytes) -> array[Any]:
-    numbers = array(typecode, data)
+        raise wire.MalformedMessage(
+            "wrong_type", f"{field}: expected bytes, rows of three numbers of 4 bytes"
+        )
+    if rows_field is not None and message.get(rows_field) != len(value) // 12:
+        raise wire.MalformedMessage(
+            "wrong_shape",
+            f"{field} has {len(value) // 12} rows: expected {rows_field}, {message.get(rows_field)}",
+        )
+    numbers = array(typecode, value)
     if sys.byteorder == "big":
         numbers.byteswap()
     return numbers

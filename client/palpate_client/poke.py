@@ -13,7 +13,7 @@ import json
 import math
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,8 @@ from palpate_client.tool import Tool
 STATUS_WAIT_S = 1.0  # statuses come ten times a second
 
 
-def main() -> int:
-    options = parse_options()
+def main(arguments: Sequence[str] | None = None) -> int:
+    options = parse_options(arguments)
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # silent unless RUST_LOG says otherwise
     try:
         with connection_for(options) as connection:
@@ -183,7 +183,7 @@ def readable(summary: dict[str, Any]) -> str:
     )
 
 
-def parse_options() -> argparse.Namespace:
+def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="palpate client", description=(__doc__ or "").splitlines()[0])
     add_connection_options(parser)
     parser.add_argument("--tool", help="name of the tool to move (default: the model's first)")
@@ -203,7 +203,7 @@ def parse_options() -> argparse.Namespace:
         parser.add_argument(name, type=positive, default=default, help=f"{text} (%(default)s)")
     parser.add_argument("--record", metavar="FILE.csv", help="write every tick: position applied and force")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    return parser.parse_args()
+    return parser.parse_args(arguments)
 
 
 if __name__ == "__main__":

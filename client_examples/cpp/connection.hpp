@@ -1,4 +1,4 @@
-// A client's side of the wire: connect, learn what there is, take a contact, send commands, hear forces.
+// A client's side of the wire: connect, describe, acquire a tool, send commands, receive forces (docs/wire.md).
 //
 // Needs zenoh-cpp over zenoh-c, and msgpack-c.
 #pragma once
@@ -31,14 +31,15 @@ struct Refused : std::runtime_error {
     using std::runtime_error::runtime_error;
 };
 
-struct Contact {
+struct Tool {
     std::string name;
-    Vec3 normal{};  // outwards, of length 1
+    Vec3 start_m{};  // where the tip touches the undeformed tissue, in the model's frame
+    Vec3 normal{};   // outwards, of length 1
 };
 
 struct Description {
     std::string model;  // the sha256 of what it was built from
-    std::vector<Contact> contacts;
+    std::vector<Tool> tools;
     Promise promise;
 };
 
@@ -48,19 +49,20 @@ struct DeviceTerms {
     double damping_n_s_per_m = 0.0, round_trip_s = 0.0;
 };
 
-struct Agreed {
+struct Acquired {
     double max_force_n = 0.0;
+    Vec3 home_m{};  // where the tip is at the tool's start, in our frame
     std::vector<std::string> warnings;  // for the user
 };
 
 struct Command {
     std::int64_t sequence = 0, client_time_ns = 0;
-    Vec3 displacement_m{}, velocity_m_per_s{};
+    Vec3 position_m{}, velocity_m_per_s{};
     std::optional<std::int64_t> rendered_tick;
 };
 
-// One client in one session, for one contact. Zenoh's thread hears, and leaves what it heard; all that is
-// public here belongs to one other thread.
+// One client in one session, for one tool. Zenoh's threads receive and queue; all that is public here belongs to one
+// other thread.
 class Connection {
  public:
     Connection(const std::string& endpoint, const std::string& zenoh_config, const std::string& session,
@@ -70,7 +72,7 @@ class Connection {
           client_(client),
           zenoh_(open(endpoint, zenoh_config)) {
         // The token is our sign of life: when it goes, because we are killed or cut off, the server takes our
-        // contact back and lets its force fade.
+        // tool back and lets its force fade.
         token_.emplace(zenoh_.liveliness_declare_token(prefix_ + "/client/" + client_));
         // The server has one too: it tells us when there is a server, and that it is gone faster than any
         // timeout could.
@@ -101,46 +103,55 @@ class Connection {
     bool stopping() const { return stopping_; }      // the server says so
     bool unreadable() const { return unreadable_; }  // it has sent what is not of docs/wire.md
 
-    // From now on hear each tick's answer for a contact.
-    void hear(std::size_t contact) {
-        const auto receive = [this, contact](const zenoh::Sample& sample) {
+    // From now on receive what each tick does with a tool.
+    void receive_forces(std::size_t tool) {
+        const auto receive = [this, tool](const zenoh::Sample& sample) {
             const std::int64_t arrival_ns = now_ns();
-            guarded([&] { heard_.push(force(sample, contact, arrival_ns)); });
+            guarded([&] { on_force(sample, tool, arrival_ns); });
         };
         forces_.emplace(zenoh_.declare_subscriber(prefix_ + "/force", receive, zenoh::closures::none));
     }
 
-    // The next force that was heard, if there is one.
-    bool take(Force& force) { return heard_.pop(force); }
+    // The next force that was received, if there is one.
+    bool take(Force& force) { return received_.pop(force); }
 
-    // Take a contact for ourselves alone; only then are our commands for it heard.
-    Agreed acquire(const std::string& contact, const std::optional<DeviceTerms>& device) {
-        contact_ = contact;
+    // Acquire a tool; only then are our commands for it used. Our frame has the model's axes and unit, and the tool's start
+    // as its origin: positions are m from where the tip touches the tissue without pressing.
+    Acquired acquire(const Tool& tool, const std::optional<DeviceTerms>& device) {
+        tool_ = tool.name;
         msgpack::sbuffer request;
-        msgpack::packer<msgpack::sbuffer> packer(request);
-        packer.pack_map(device ? 4 : 1).pack("contacts").pack(std::vector<std::string>{contact});
+        auto packer = begin_request(request, device ? 5 : 2);
+        packer.pack("tools").pack(std::vector<std::string>{tool.name});
+        packer.pack("frame").pack_map(1).pack("model_origin_m").pack(tool.start_m);
         if (device) {
             packer.pack("device").pack(device->profile);
             packer.pack("device_damping_n_s_per_m").pack(device->damping_n_s_per_m);
             packer.pack("round_trip_s").pack(device->round_trip_s);
         }
         const auto answer = query("control/" + client_ + "/acquire", &request);
-        Agreed agreed;
-        agreed.max_force_n = field(field(*answer, "limits"), "max_force_n").as<double>();
-        agreed.warnings = field(*answer, "warnings").as<std::vector<std::string>>();
-        return agreed;
+        const auto& agreed = field(field(*answer, "tools"), tool.name);
+        Acquired acquired;
+        acquired.max_force_n = field(field(agreed, "limits"), "max_force_n").as<double>();
+        acquired.home_m = field(agreed, "home_m").as<Vec3>();
+        acquired.warnings = field(*answer, "warnings").as<std::vector<std::string>>();
+        return acquired;
     }
 
-    void release() { query("control/" + client_ + "/release"); }
+    void release() {
+        msgpack::sbuffer request;
+        begin_request(request, 0);
+        query("control/" + client_ + "/release", &request);
+    }
 
     void send(const Command& command) {
         message_.clear();  // it keeps its memory
         msgpack::packer<msgpack::sbuffer> packer(message_);
-        packer.pack_map(command.rendered_tick ? 5 : 4);
+        packer.pack_map(command.rendered_tick ? 6 : 5);
+        packer.pack("kind").pack("command");
         packer.pack("sequence").pack(command.sequence);
         packer.pack("client_time_ns").pack(command.client_time_ns);
-        packer.pack("displacement_m").pack_map(1).pack(contact_).pack(command.displacement_m);
-        packer.pack("velocity_m_per_s").pack_map(1).pack(contact_).pack(command.velocity_m_per_s);
+        packer.pack("position_m").pack_map(1).pack(tool_).pack(command.position_m);
+        packer.pack("velocity_m_per_s").pack_map(1).pack(tool_).pack(command.velocity_m_per_s);
         if (command.rendered_tick) packer.pack("rendered_tick").pack(*command.rendered_tick);
         // A command that could not be sent is one without an answer: what then happens is the same.
         zenoh::ZResult unsent{};
@@ -150,6 +161,16 @@ class Connection {
 
  private:
     static constexpr std::int64_t patience_ns = 3'000'000'000;
+    static constexpr int schema_version = 2;
+
+    // What every request begins with; then its own fields follow.
+    static msgpack::packer<msgpack::sbuffer> begin_request(msgpack::sbuffer& request, std::uint32_t fields) {
+        msgpack::packer<msgpack::sbuffer> packer(request);
+        packer.pack_map(fields + 2);
+        packer.pack("kind").pack("request");
+        packer.pack("schema_version").pack(schema_version);
+        return packer;
+    }
 
     static zenoh::Session open(const std::string& endpoint, const std::string& zenoh_config) {
         auto config = configuration(endpoint, zenoh_config);
@@ -183,7 +204,10 @@ class Connection {
         config.insert_json5("connect/exit_on_failure", "true");
         config.insert_json5("scouting/multicast/enabled", "false");
         config.insert_json5("scouting/gossip/enabled", "false");
-        config.insert_json5("transport/link/tx/lease", "1000");
+        config.insert_json5("connect/retry", R"({period_init_ms: 100, period_max_ms: 500, period_increase_factor: 2})");
+        config.insert_json5("transport/unicast/open_timeout", "2000");
+        config.insert_json5("transport/link/tx/lease", "4000");
+        config.insert_json5("transport/link/tx/keep_alive", "8");
         return config;
     }
 
@@ -208,11 +232,14 @@ class Connection {
 
     void read_description(const msgpack::object& answer) {
         const auto version = field(answer, "schema_version").as<int>();
-        if (version != 1) throw Refused("the server speaks schema version " + std::to_string(version) + ", we 1");
+        if (version != schema_version) {
+            throw Refused("the server speaks schema version " + std::to_string(version) + ", this client " +
+                          std::to_string(schema_version) + ": take both from the same version of palpate");
+        }
         description_.model = field(field(answer, "model"), "config_sha256").as<std::string>();
-        for (const auto& contact : field(answer, "contacts").as<std::vector<msgpack::object>>()) {
-            description_.contacts.push_back(
-                {field(contact, "name").as<std::string>(), field(contact, "normal").as<Vec3>()});
+        for (const auto& tool : field(answer, "tools").as<std::vector<msgpack::object>>()) {
+            description_.tools.push_back({field(tool, "name").as<std::string>(), field(tool, "start_m").as<Vec3>(),
+                                          field(tool, "normal").as<Vec3>()});
         }
         const auto& limits = field(answer, "limits");
         const auto& flags = field(answer, "flags");
@@ -269,24 +296,31 @@ class Connection {
         return list.via.array.ptr[i];
     }
 
-    static Force force(const zenoh::Sample& sample, std::size_t contact, std::int64_t arrival_ns) {
+    static bool is_kind(const msgpack::object& message, const char* kind) {
+        return field(message, "kind").as<std::string>() == kind;
+    }
+
+    // A message of another kind than its key's is ignored.
+    void on_force(const zenoh::Sample& sample, std::size_t tool, std::int64_t arrival_ns) {
         const auto message = unpack(sample.get_payload());
-        const auto of_contact = [&](const char* name) -> const msgpack::object& {
-            return element(field(*message, name), contact);
+        if (!is_kind(*message, "force")) return;
+        const auto of_tool = [&](const char* name) -> const msgpack::object& {
+            return element(field(*message, name), tool);
         };
         Force force;
         force.tick = field(*message, "tick").as<std::int64_t>();
-        force.sequence = of_contact("sequence").as<std::int64_t>();
-        force.client_time_ns = of_contact("client_time_ns").as<std::int64_t>();
-        force.input_age_ns = of_contact("input_age_ns").as<std::int64_t>();
-        force.flags = of_contact("flags").as<std::int64_t>();
-        force.force_n = of_contact("force_n").as<Vec3>();
+        force.sequence = of_tool("sequence").as<std::int64_t>();
+        force.client_time_ns = of_tool("client_time_ns").as<std::int64_t>();
+        force.input_age_ns = of_tool("input_age_ns").as<std::int64_t>();
+        force.flags = of_tool("flags").as<std::int64_t>();
+        force.force_n = of_tool("force_n").as<Vec3>();
         force.arrival_ns = arrival_ns;
-        return force;
+        received_.push(force);
     }
 
     void on_status(const zenoh::Sample& sample) {
         const auto message = unpack(sample.get_payload());
+        if (!is_kind(*message, "status")) return;
         if (field(*message, "state").as<std::string>() == "stopping") stopping_ = true;
     }
 
@@ -300,9 +334,9 @@ class Connection {
         }
     }
 
-    std::string place_, prefix_, client_, contact_;
+    std::string place_, prefix_, client_, tool_;
     std::atomic<bool> there_{false}, gone_{false}, stopping_{false}, unreadable_{false};
-    Queue<Force, 4096> heard_;  // a query may take 3 s
+    Queue<Force, 4096> received_;  // a query may take 3 s
     Description description_;
     msgpack::sbuffer message_;
     // What follows is taken down in reverse: nothing is called any more when the members above go.

@@ -19,18 +19,18 @@
 
 namespace palpate {
 
-// Of one tick, what concerns our contact. Times are ns; `client_time_ns` and `arrival_ns` on our own clock.
+// Of one tick, what concerns our tool. Times are ns; `client_time_ns` and `arrival_ns` on our own clock.
 struct Force {
     std::int64_t tick = 0;
     std::int64_t sequence = -1;
     std::int64_t client_time_ns = -1;
     std::int64_t input_age_ns = -1;
     std::int64_t flags = 0;
-    Vec3 force_n{};  // what the tip does to the tissue
+    Vec3 force_n{};  // what the device renders: the force of the tissue on the tool
     std::int64_t arrival_ns = 0;
 };
 
-// What the server's answer to `describe` promises for every contact.
+// What the server's answer to `describe` promises for every tool.
 struct Promise {
     double period_s = 0.0, hold_s = 0.0, decay_s = 0.0;
     double max_force_n = 0.0, max_force_rate_n_per_s = 0.0;
@@ -89,7 +89,7 @@ class RoundTrips {
     std::int64_t count_ = 0, longest_ns_ = 0;
 };
 
-// Feed it every command sent and every force received, for one contact; it keeps what broke the contract.
+// Feed it every command sent and every force received, for one tool; it keeps what broke the contract.
 class Contract {
  public:
     explicit Contract(const Promise& promise)
@@ -100,14 +100,14 @@ class Contract {
           hold_ns_((promise.hold_s + promise.period_s) * 1e9),
           fade_ns_((promise.hold_s + promise.decay_s) * 1e9) {}
 
-    // The answer to `acquire` is here: from now on we hold the contact, within these limits.
+    // The answer to `acquire` is here: from now on we hold the tool, within these limits.
     void agree(double max_force_n) {
         max_force_n_ = max_force_n;
         newest_answered_ = -1;
         holding_ = true;
     }
 
-    // Call it before the contact is given back, or acquired again: our commands are then forgotten rightly.
+    // Call it before the tool is released, or acquired again: our commands are then forgotten rightly.
     void release() { holding_ = false; }
 
     // Call it before the command is sent: the answer may come before the sending returns.
@@ -118,7 +118,7 @@ class Contract {
         ++commands_;
     }
 
-    // Whether nothing about this force breaks the contract: while we hold the contact, only then may it be
+    // Whether nothing about this force breaks the contract: while we hold the tool, only then may it be
     // rendered.
     bool on_force(const Force& f) {
         const std::int64_t breaks = breaks_;
@@ -142,10 +142,9 @@ class Contract {
     static constexpr double slack = 1e-9;               // of a newton: rounding
     static constexpr std::int64_t remembered = 10'000;  // commands: answers to older ones break the contract anyway
     static constexpr std::size_t told = 20;             // one cause can break every tick; the first ones tell
-    // A busy machine or network may hold commands up until the force has faded, which the flags tell and
-    // nobody has promised to prevent. A link on which nothing moves for as long as this is closed, so that
-    // then it is not the link.
-    static constexpr std::int64_t unheard_limit_ns = 1'000'000'000;
+    // A busy machine or network may delay commands until the force has faded. The flags tell, and nobody has promised
+    // to prevent it. Zenoh closes a link on which nothing moves for this long, so a longer silence has another cause.
+    static constexpr std::int64_t unheard_limit_ns = 4'000'000'000;
 
     struct Sent {
         std::int64_t sequence = -1, client_time_ns = 0;
@@ -175,8 +174,8 @@ class Contract {
             // The server keeps a holder's last command, however silent the holder is.
             lose();
             broke(f.tick,
-                  "we no longer hold the contact, our commands are forgotten: it was released or taken back "
-                  "(after a second of silence, for instance), or the server has stopped or was started again");
+                  "we no longer hold the tool, our commands are forgotten: it was released or taken back "
+                  "(after a long silence, for instance), or the server has stopped or was started again");
             return;
         }
         if (!follows(f)) return;
@@ -212,10 +211,10 @@ class Contract {
                 round_trips_.add(f.arrival_ns - sent.client_time_ns);
             }
             if (holding_) check_heard(f, sent.client_time_ns);
-        } else if (holding_) {  // while we don't hold the contact, others' are answered
+        } else if (holding_) {  // without the tool, the answers are to other clients
             lose();
             broke(f.tick,
-                  "we no longer hold the contact: it answers command %lld, which was not sent (or not at that time)",
+                  "we no longer hold the tool: it answers command %lld, which was not sent (or not at that time)",
                   static_cast<long long>(f.sequence));
         }
     }

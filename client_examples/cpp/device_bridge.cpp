@@ -1,7 +1,7 @@
 // Close the loop with a haptic device: read its position, send it, render the force.
 //
 // Whatever ends it, the device is left without a force. Exit code 0: all well. 1: the contract was broken,
-// the contact was lost, the server went away or the device failed. 2: it could not start. 130: Ctrl-C,
+// the tool was lost, the server went away or the device failed. 2: it could not start. 130: Ctrl-C,
 // SIGTERM, SIGQUIT or SIGHUP.
 
 #include DEVICE_HEADER
@@ -36,7 +36,7 @@ constexpr double settle_s = 0.5, measure_s = 1.0;
 constexpr double longest_s = 1e9;  // that an option may be: thirty years, which are still countable in ns
 
 struct Options {
-    std::string connect = "tcp/127.0.0.1:7447", zenoh_config, session = "main", name, contact, device = "generic";
+    std::string connect = "tcp/127.0.0.1:7447", zenoh_config, session = "main", name, tool, device = "generic";
     double silence_s = 0.1, wait_s = 0.0, duration_s = 5.0;
 };
 
@@ -44,7 +44,7 @@ struct Options {
 std::atomic<bool> device_opened{false}, interrupted{false};
 
 void on_signal(int) {
-    if (!device_opened) _exit(130);  // nothing is rendered; our contact is free as soon as our token is gone
+    if (!device_opened) _exit(130);  // nothing is rendered; our tool is free as soon as our token is gone
     interrupted = true;
 }
 
@@ -66,18 +66,18 @@ class Driving {
 // One agreement with one server: from `acquire` to `release`, or to the loss of either.
 class Bridge {
  public:
-    Bridge(Connection& connection, std::size_t contact, const Options& options)
+    Bridge(Connection& connection, std::size_t tool, const Options& options)
         : connection_(connection),
-          contact_(connection.description().contacts[contact]),
-          inwards_(-1.0 * contact_.normal),
+          tool_(connection.description().tools[tool]),
+          inwards_(-1.0 * tool_.normal),
           options_(options),
           period_ns_(std::llround(connection.description().promise.period_s * 1e9)),
           contract_(connection.description().promise),
           gate_(std::llround(connection.description().promise.hold_s * 1e9)) {
-        connection.hear(contact);
+        connection.receive_forces(tool);
     }
 
-    // Take the contact, twice: with the device's damping and the round trip, which has to be measured first,
+    // Acquire the tool, twice: with the device's damping and the round trip, which has to be measured first,
     // the server can tell whether the device might vibrate. With a device it also watches the energy that
     // goes through our hands, and damps what would build up.
     void agree() {
@@ -85,7 +85,9 @@ class Bridge {
             connection_.release();  // what a client of our name left behind
         } catch (const Refused&) {
         }
-        contract_.agree(connection_.acquire(contact_.name, std::nullopt).max_force_n);
+        const auto first = connection_.acquire(tool_, std::nullopt);
+        home_m_ = first.home_m;
+        contract_.agree(first.max_force_n);
         rest(settle_s);
         contract_.measure_anew();
         rest(measure_s);
@@ -96,7 +98,7 @@ class Bridge {
         round_trip_s_ = *told + 1e-9 * static_cast<double>(period_ns_);  // until our next step renders it
         contract_.release();
         const auto agreed =
-            connection_.acquire(contact_.name, DeviceTerms{options_.device, Device::damping_n_s_per_m, round_trip_s_});
+            connection_.acquire(tool_, DeviceTerms{options_.device, Device::damping_n_s_per_m, round_trip_s_});
         take_forces();  // those of before
         contract_.agree(agreed.max_force_n);
         for (const auto& warning : agreed.warnings) std::cerr << "warning: " << warning << '\n';
@@ -119,7 +121,7 @@ class Bridge {
         return trouble;
     }
 
-    // The contact is given back; what was lost when that has no answer.
+    // The tool is released; what was lost when that has no answer.
     std::optional<std::string> release() {
         std::this_thread::sleep_for(std::chrono::milliseconds(50));  // the last answers are still under way
         take_forces();
@@ -163,13 +165,12 @@ class Bridge {
         const bool inside = gate_.open(now_ns() - newest_.arrival_ns, depth > 0);
         if (!inside) touched_ = position - depth * inwards_;
         Command command;
-        command.displacement_m = inside ? position - touched_ : Vec3{};
+        command.position_m = inside ? home_m_ + (position - touched_) : home_m_;
         // The velocity lets the server carry the motion on when a command is late; the tick tells it which of
         // its forces acted until now, so that it can count the energy exactly although messages take time.
         command.velocity_m_per_s = inside ? device.velocity_m_per_s() : Vec3{};
         command.rendered_tick = rendered_tick_;
-        // The message holds what the tip does to the tissue; the hand feels the opposite.
-        device.render(inside ? -1.0 * newest_.force_n : Vec3{});
+        device.render(inside ? newest_.force_n : Vec3{});  // with its sign, as it comes
         rendered_tick_ = newest_.tick;
         send(command);
     }
@@ -180,7 +181,9 @@ class Bridge {
         while (now_ns() < end_ns && !connection_.gone()) {
             if (interrupted) throw Interrupted{};
             take_forces();
-            send(Command{});
+            Command command;
+            command.position_m = home_m_;
+            send(command);
             deadlines_.wait();
         }
     }
@@ -203,7 +206,7 @@ class Bridge {
         if (connection_.stopping()) return "the server is stopping";  // it says so before it goes
         if (connection_.gone()) return "the server is gone, or the link to it: its liveliness token was taken back";
         if (connection_.unreadable()) return "the server sent what can't be read";
-        if (!contract_.holding()) return "the contact is no longer ours";
+        if (!contract_.holding()) return "the tool is no longer ours";
         if (static_cast<double>(now_ns() - newest_.arrival_ns) > options_.silence_s * 1e9) {
             return "the server is silent: no force for " + std::to_string(options_.silence_s) + " s";
         }
@@ -211,7 +214,7 @@ class Bridge {
     }
 
     Connection& connection_;
-    const Contact& contact_;
+    const Tool& tool_;
     const Vec3 inwards_;
     const Options& options_;
     std::int64_t period_ns_;
@@ -219,19 +222,20 @@ class Bridge {
     Contract contract_;
     Gate gate_;
     Force newest_;
+    Vec3 home_m_{};   // where the tip touches without pressing
     Vec3 touched_{};  // where the tip went in, on the surface
     std::optional<std::int64_t> rendered_tick_;
     std::int64_t sequence_ = 0, missed_ = 0;
     double round_trip_s_ = 0.0, deepest_m_ = 0.0;
 };
 
-std::size_t find_contact(const Description& description, const std::string& name) {
+std::size_t find_tool(const Description& description, const std::string& name) {
     std::string names;
-    for (std::size_t i = 0; i < description.contacts.size(); ++i) {
-        if (name.empty() || description.contacts[i].name == name) return i;
-        names += (i ? ", " : "") + description.contacts[i].name;
+    for (std::size_t i = 0; i < description.tools.size(); ++i) {
+        if (name.empty() || description.tools[i].name == name) return i;
+        names += (i ? ", " : "") + description.tools[i].name;
     }
-    throw Refused("no contact is called '" + name + "': there are " + names);
+    throw Refused("no tool is called '" + name + "': there are " + names);
 }
 
 int run(const Options& options) {
@@ -251,16 +255,16 @@ int run(const Options& options) {
             Connection connection(options.connect, options.zenoh_config, options.session, options.name);
             raise_priority(loop_priority);
             const auto& description = connection.description();
-            const std::size_t contact = find_contact(description, options.contact);
+            const std::size_t tool = find_tool(description, options.tool);
             if (!device) {
                 device_opened = true;
-                device.emplace(-1.0 * description.contacts[contact].normal);
+                device.emplace(-1.0 * description.tools[tool].normal);
                 device->render({});
                 model = description.model;
             } else if (description.model != model) {
                 throw Refused("the server that came again runs another model");
             }
-            Bridge bridge(connection, contact, options);
+            Bridge bridge(connection, tool, options);
             bridge.agree();
             if (!end_ns) end_ns = now_ns() + std::llround(options.duration_s * 1e9);
             auto trouble = bridge.drive(*device, end_ns);
@@ -293,7 +297,7 @@ int run(const Options& options) {
         << "  --zenoh-config FILE  Zenoh configuration to use instead of --connect\n"
         << "  --session NAME       the server's --session (" << preset.session << ")\n"
         << "  --name NAME          this client's (a random one)\n"
-        << "  --contact NAME       the contact to take (the model's first)\n"
+        << "  --tool NAME          the tool to hold (the model's first)\n"
         << "  --device NAME        profile whose limits are to hold (" << preset.device << ")\n"
         << "  --duration-s S       how long to drive the device (" << preset.duration_s << ")\n"
         << "  --silence-s S        without a force for so long, let go (" << preset.silence_s << ")\n"
@@ -311,7 +315,7 @@ Options parse(int argc, char** argv) {
     Options options;
     const std::pair<const char*, std::string*> texts[] = {
         {"connect", &options.connect}, {"zenoh-config", &options.zenoh_config}, {"session", &options.session},
-        {"name", &options.name},       {"contact", &options.contact},           {"device", &options.device}};
+        {"name", &options.name},       {"tool", &options.tool},                 {"device", &options.device}};
     const std::pair<const char*, double*> numbers[] = {
         {"duration-s", &options.duration_s}, {"silence-s", &options.silence_s}, {"wait-s", &options.wait_s}};
     std::random_device random;

@@ -17,8 +17,9 @@ class Device {
     // `inwards` is a direction of length 1, into the tissue.
     explicit Device(const Vec3& inwards) : inwards_(inwards) {}
 
-    // Where the tip is, m from the undeformed surface at the contact, and how fast, m/s, along the model's axes. A
-    // device with axes of its own turns its positions into the model's, and forces back.
+    // Where the tip is, m from where it touches the undeformed tissue, and how fast, m/s, along the model's axes. A
+    // device with axes of its own turns its positions into the model's and forces back, or declares its frame in
+    // Connection::acquire.
     Vec3 position_m() const { return position_ * inwards_; }
     Vec3 velocity_m_per_s() const { return velocity_ * inwards_; }
 

@@ -133,37 +133,37 @@ def inspect(
 @app.command(context_settings=PASS_THROUGH)
 def serve(context: typer.Context) -> None:
     """Run a model file at 1 kHz over Zenoh (`palpate serve --help` for its options)."""
-    _run_server_tool("palpate_server", context.args)
+    _run_module("palpate_server", context.args)
 
 
 @app.command(context_settings=PASS_THROUGH)
 def record(context: typer.Context) -> None:
     """Record a running server's commands, forces and status to an MCAP file (`palpate record --help`)."""
-    _run_server_tool("palpate_server.recording.record", context.args)
+    _run_module("palpate_server.recording.record", context.args)
 
 
 @app.command(context_settings=PASS_THROUGH)
 def replay(context: typer.Context) -> None:
     """Repeat a recording offline through a model and compare bit for bit (`palpate replay --help`)."""
-    _run_server_tool("palpate_server.recording.replay", context.args)
+    _run_module("palpate_server.recording.replay", context.args)
 
 
 @app.command(name="check-host", context_settings=PASS_THROUGH)
 def check_host(context: typer.Context) -> None:
     """Measure whether this machine can hold 1 kHz, and say what to change (`palpate check-host --help`)."""
-    _run_server_tool("palpate_server.diagnostics.check_host", context.args)
+    _run_module("palpate_server.diagnostics.check_host", context.args)
 
 
 @app.command(context_settings=PASS_THROUGH)
 def client(context: typer.Context) -> None:
     """Poke a running server and check every answer (`palpate client --help` for its options)."""
-    _run_example("headless_client.py", context.args)
+    _run_module("palpate_client.poke", context.args)
 
 
 @app.command(context_settings=PASS_THROUGH)
 def health(context: typer.Context) -> None:
     """Say whether a server is there and its loop runs (`palpate health --help` for its options)."""
-    _run_example("health.py", context.args)
+    _run_module("palpate_client.health", context.args)
 
 
 @app.command()
@@ -177,7 +177,7 @@ def demo(
     with stage_reporter() as report:
         summary = run_demo(Path(str(files("palpate_configs") / "liver.toml")), out, seconds, report)
     print_accuracy(summary.model)
-    summary.print(console)
+    console.print("\n".join(summary.lines()), highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -199,15 +199,9 @@ def reproduce(
         console.print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 
-def _run_server_tool(module: str, arguments: list[str]) -> None:
-    """Become a module of the server: a process of its own, so that the loop shares nothing with the offline stage."""
+def _run_module(module: str, arguments: list[str]) -> None:
+    """Become a module of the server or the client: a process that shares nothing with the offline stage."""
     os.execv(sys.executable, [sys.executable, "-m", module, *arguments])
-
-
-def _run_example(name: str, arguments: list[str]) -> None:
-    """Become a client example, as installed."""
-    path = str(files("palpate_client_examples") / name)
-    os.execv(sys.executable, [sys.executable, path, *arguments])
 
 
 @contextmanager

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
-import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from palpate.build import build_model
 from palpate.lti.pole_residue import full_system
@@ -24,11 +19,11 @@ from palpate.model_file import ModelFileError, ReducedModel, load_model, save_mo
 from palpate.plots import Touch, draw_touch, require_matplotlib
 from palpate.progress import Progress
 from palpate.scene.schema import fingerprint, load_config
+from palpate_client.local_server import free_endpoint, running
 
 Array = NDArray[np.float64]
 
-_START_TIMEOUT_S = 60.0
-_STOP_TIMEOUT_S = 10.0
+_CLIENT_TIMEOUT_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -49,26 +44,25 @@ class Demo:
     error: float
     error_in_band: float
 
-    def print(self, console: Console) -> None:
-        """The latency and force summary."""
+    def lines(self) -> list[str]:
+        """The summary of latency and force, for a person."""
         trip = self.client["round_trip_s"]
         times = ", ".join(f"{name} {1e6 * trip[key]:.0f}" for name, key in (("p50", "p50"), ("p99", "p99")))
         inward = -np.asarray(self.model.contacts[0].normal)
-        force = self.touch.force_n[:, :3] @ inward
+        force = self.touch.force_n[:, :3] @ -inward
         depth = self.touch.displacement_m[:, :3] @ inward
-        lines = (
+        return [
             f"commands      {self.client['commands_sent']:,} sent, {self.client['commands_answered']:,} answered",
             f"round trip    {times} microseconds, command to force, over the wire",
             f"depth         up to {1e3 * depth.max():.2f} mm",
-            f"force         {force.min():+.3f} to {force.max():+.3f} N along the inward normal",
+            f"force         {force.min():+.3f} to {force.max():+.3f} N along the outward normal: positive pushes the device out",
             f"full model    served and exact force differ by at most {100 * self.error_in_band:.2g} % of the largest "
             f"force below {self.model.accuracy.band_hz[1]:g} Hz (the file states {100 * self.model.accuracy.error_in_band:.2g} %); "
             f"{100 * self.error:.2g} % with all that late commands add above",
             f"contract      {'BROKEN: ' + '; '.join(self.client['contract_broken']) if self.client['contract_broken'] else 'held'}",
             f"model         {self.model_path}",
             f"picture       {self.picture}",
-        )
-        console.print("\n".join(lines), highlight=False, soft_wrap=True)
+        ]
 
 
 def run_demo(config_path: Path, out: Path, seconds: float, progress: Progress) -> Demo:
@@ -81,7 +75,11 @@ def run_demo(config_path: Path, out: Path, seconds: float, progress: Progress) -
     model_path = out / f"{config_path.stem}.npz"
     model = _built(model_path, config_path, progress)
     recording = out / "poke.csv"
-    with _server(model_path, progress) as endpoint:
+    progress("server in a second process")
+    endpoint = free_endpoint()
+    command = [sys.executable, "-m", "palpate_server", str(model_path), "--listen", endpoint]
+    with running(command, "serving") as (_, line):
+        progress.note(line)
         progress(f"poke, {seconds:g} s")
         client = _poke(endpoint, seconds, recording)
         progress.note(f"{client['commands_answered']:,} of {client['commands_sent']:,} commands answered")
@@ -99,7 +97,7 @@ def run_demo(config_path: Path, out: Path, seconds: float, progress: Progress) -
 
 
 def read_touch(recording: Path, model: ReducedModel) -> Touch:
-    """A recording of the headless client beside the full model's exact answer to the displacement that was applied.
+    """A recording of the headless client beside what a device would render with the full model, for the same positions.
 
     Raises ValueError where it lacks a column or a contact, or no tick was recorded.
     """
@@ -119,12 +117,14 @@ def read_touch(recording: Path, model: ReducedModel) -> Touch:
     scale = np.repeat(
         [[float(row[f"{c.name}.force_scale"]) for c in model.contacts] for row in rows], 3, axis=1
     )
-    applied, force = columns("displacement", "m"), columns("force", "n")
+    start = np.concatenate([contact.center_m for contact in model.contacts])
+    applied, force = columns("position", "m") - start, columns("force", "n")
     # Force messages are best effort: the displacement of a tick that was not heard is interpolated.
     ticks = np.arange(heard[0], heard[-1] + 1)
     every = np.stack([np.interp(ticks, heard, channel) for channel in applied.T], axis=1)
     exact = full_system(model.full).response(every, model.period_s)[heard - heard[0]]
-    return Touch((heard - heard[0]) * model.period_s, applied, force, scale * exact)
+    # The model's force is what the tip does to the tissue, the device's is its negative.
+    return Touch((heard - heard[0]) * model.period_s, applied, force, -scale * exact)
 
 
 def _built(path: Path, config_path: Path, progress: Progress) -> ReducedModel:
@@ -145,36 +145,11 @@ def _built(path: Path, config_path: Path, progress: Progress) -> ReducedModel:
     return model
 
 
-@contextmanager
-def _server(model_path: Path, progress: Progress) -> Iterator[str]:
-    """A server process on a free port of this machine, ended on the way out; gives its endpoint."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    progress("server in a second process")
-    command = [sys.executable, "-m", "palpate_server", str(model_path), "--listen", endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            first = process.stdout.readline().strip()
-            if not first:
-                raise ValueError(f"the server did not start (exit code {process.wait(_STOP_TIMEOUT_S)})")
-            progress.note(first)
-            yield endpoint
-        finally:
-            process.terminate()
-            try:
-                process.wait(_STOP_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-
-
 def _poke(endpoint: str, seconds: float, recording: Path) -> dict[str, Any]:
-    client = str(files("palpate_client_examples") / "headless_client.py")
-    command = [sys.executable, client, "--connect", endpoint, "--duration-s", str(seconds)]
-    command += ["--json", "--record", str(recording)]
+    command = [sys.executable, "-m", "palpate_client.poke", "--connect", endpoint]
+    command += ["--duration-s", str(seconds), "--json", "--record", str(recording)]
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=seconds + _START_TIMEOUT_S, check=False
+        command, capture_output=True, text=True, timeout=seconds + _CLIENT_TIMEOUT_S, check=False
     )
     try:
         summary: dict[str, Any] = json.loads(done.stdout)

@@ -22,8 +22,8 @@ class Touch:
 
     time_s           (n_ticks,), s
     displacement_m   (n_ticks, n_inputs), applied by the server at each tick
-    force_n          (n_ticks, n_outputs), as received over the wire
-    force_full_n     (n_ticks, n_outputs), the full model's exact response to the same displacement
+    force_n          (n_ticks, n_outputs), what the device renders, as received over the wire
+    force_full_n     (n_ticks, n_outputs), the same with the full model's exact response to this displacement
     """
 
     time_s: Array
@@ -63,7 +63,7 @@ def draw_touch(model: ReducedModel, touch: Touch, contact: int, path: Path) -> N
     along = slice(3 * contact, 3 * contact + 3)
     inward = -np.asarray(model.contacts[contact].normal)
     depth = touch.displacement_m[:, along] @ inward
-    served, full = touch.force_n[:, along] @ inward, touch.force_full_n[:, along] @ inward
+    served, full = touch.force_n[:, along] @ -inward, touch.force_full_n[:, along] @ -inward
     largest = float(np.max(np.linalg.norm(touch.force_full_n, axis=1)))
     deepest = int(np.argmax(np.abs(depth)))
 
@@ -83,7 +83,7 @@ def draw_touch(model: ReducedModel, touch: Touch, contact: int, path: Path) -> N
     axes[1].plot(
         touch.time_s, served, color="tab:red", linewidth=1.1, label=f"over the wire, order {model.order}"
     )
-    axes[1].set_ylabel("reaction force, N\n(along the inward normal)")
+    axes[1].set_ylabel("force on the device, N\n(positive: pushes it out)")
     axes[1].set_ylim(top=1.35 * float(max(full.max(), served.max())))
     axes[1].legend(loc="upper right", ncols=2, frameon=False, fontsize="small")
     difference = touch.force_n - touch.force_full_n

@@ -25,7 +25,7 @@ import pytest
 import zenoh
 
 from palpate.model_file import ReducedModel, save_model
-from palpate_server.diagnostics.round_trips import free_endpoint
+from palpate_client.local_server import free_endpoint
 from palpate_server.diagnostics.sample_model import spring_mass_model
 
 EXAMPLES = Path(__file__).parents[2] / "client_examples"
@@ -189,11 +189,14 @@ def serve_for_module(
 
 @pytest.fixture
 def run_example(start: Callable[..., Program]) -> Callable[..., Program]:
-    """run_example(script, endpoint, *options) -> Program"""
+    """run_example(script of client_examples or module, endpoint, *options) -> Program"""
 
-    def run(script: str | Path, endpoint: str, *options: str) -> Program:
+    def run(program: str | Path, endpoint: str, *options: str) -> Program:
         patient = ("--silence-s", "30")  # a busy machine is no reason to let go
-        return start(EXAMPLES / script, "--connect", endpoint, "--session", SESSION, *patient, *options)
+        place = ("--connect", endpoint, "--session", SESSION)
+        is_script = str(program).endswith(".py")
+        what = (EXAMPLES / program,) if is_script else ("-m", program)
+        return start(*what, *place, *patient, *options)
 
     return run
 

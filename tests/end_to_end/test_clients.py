@@ -3,235 +3,217 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import signal
 import socket
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import pytest
-from palpate_client_examples.contract import Contract
 
-from palpate_server.realtime.safety import DECAY_NS, HOLD_NS, Flags
+from palpate.model_file import save_model
+from palpate_client import Connection, Frame, Incompatible, Refused, ServerGone, Tool, ToolLost, steps
+from palpate_client.local_server import free_endpoint
+from palpate_client.wire import Flags
+from palpate_server.session import transport
 
+SESSION = "test"
+RELEASE = {"kind": "request", "schema_version": 2}
 EXAMPLES = Path(__file__).parents[2] / "client_examples"
-MS = 1_000_000
-LIMITS = {"max_force_n": 1.0, "max_force_rate_n_per_s": 1000.0}
-FADE_MS = (HOLD_NS + DECAY_NS) // MS
 
-# The bridge as it is, with a driver whose motors write down where they are and each force that they are given.
-# It may begin with the hand in the tissue, or hold the loop up at the first force until a file is there.
+# The bridge as it is, with a driver whose motors write down how deep they are, m, and each force that they are given, N, along
+# the device's axis out of the tissue. It may begin with the hand in the tissue, or hold the loop up at the first force until
+# a file is there, and then until the bridge has received that the server stops.
 SPIED_BRIDGE = f"""
 import os
 import sys
-import time
 from pathlib import Path
 sys.path.insert(0, {str(EXAMPLES)!r})
 import device_bridge
+from palpate_client import Connection
 forces = Path(__file__).with_name("rendered").open("w", buffering=1)
 render = device_bridge.SimulatedDevice.render
+connections = []
+join = Connection._join
+def joined(connection):
+    connections.append(connection)
+    join(connection)
+Connection._join = joined
+def server_is_gone():
+    return connections[0]._stopping.is_set() and connections[0]._gone.is_set()
 def spied(device, force_n):
-    print(device.position_m, force_n, file=forces)
+    print(-1e-3 * device.z_mm, force_n[2], file=forces)
     render(device, force_n)
-    while force_n and "HELD_UP_UNTIL" in os.environ and not Path(os.environ["HELD_UP_UNTIL"]).exists():
+    while force_n[2] and "HOLD_UP" in os.environ and not server_is_gone():
         time.sleep(0.01)
 device_bridge.SimulatedDevice.render = spied
 begin = device_bridge.SimulatedDevice.__init__
 def begin_there(device, *properties):
     begin(device, *properties)
-    device.position_m = float(os.environ.get("BEGINS_AT_M", 0))
+    device.z_mm = -1e3 * float(os.environ.get("BEGINS_AT_M", 0))
 device_bridge.SimulatedDevice.__init__ = begin_there
 sys.exit(device_bridge.main())
 """
 
 
-# The contract, message by message. All that is said here happens in the time of the client's clock.
+# The library, against a server of its own.
 
 
-class Conversation:
-    """A contract of a client that holds its contact, fed with commands and ticks of a server one millisecond away."""
-
-    def __init__(self) -> None:
-        description = {
-            "contacts": [{"name": "tip"}],
-            "flags": {flag.name: flag.value for flag in Flags},
-            "limits": LIMITS,
-            "period_s": 1e-3,
-            "hold_s": HOLD_NS * 1e-9,
-            "decay_s": DECAY_NS * 1e-9,
-        }
-        self.contract = Contract(description, "tip")
-        self.contract.agree({"limits": LIMITS})
-        self.sent_ms: dict[int, int] = {}
-
-    def send(self, at_ms: int) -> int:
-        sequence = len(self.sent_ms) + 1
-        self.sent_ms[sequence] = at_ms
-        self.contract.on_sent({"sequence": sequence, "client_time_ns": at_ms * MS})
-        return sequence
-
-    def tick(
-        self,
-        at_ms: int,
-        newest: int,
-        heard_ms: int | None = None,
-        force_n: tuple[float, ...] = (0.0, 0.0, 0.0),
-    ) -> bool:
-        """The tick at a time, whose newest command is `newest` (-1: none), heard at once or later; may it be rendered?"""
-        age_ms = at_ms - self.sent_ms[newest] - 1 if newest >= 0 else -1
-        flags = 0
-        if not 0 <= age_ms * MS <= HOLD_NS:
-            flags = int(Flags.STALE if newest < 0 or age_ms > FADE_MS else Flags.DECAYING)
-        message = {
-            "tick": at_ms,
-            "sequence": [newest],
-            "client_time_ns": [self.sent_ms[newest] * MS if newest >= 0 else -1],
-            "input_age_ns": [age_ms * MS],
-            "flags": [flags],
-            "force_n": [list(force_n)],
-        }
-        return self.contract.on_force(message, (at_ms if heard_ms is None else heard_ms) * MS)
-
-    def go_well(self, from_ms: int, to_ms: int) -> int:
-        """A command each millisecond, each answered two later; the newest command."""
-        first = len(self.sent_ms) + 1
-        for now in range(from_ms, to_ms):
-            newest = self.send(now)
-            if newest > 2:
-                self.tick(now, max(newest - 2, first - 1))
-        return newest
+@pytest.fixture
+def connection(serve: Callable[..., Any]) -> Iterator[Connection]:
+    with Connection(serve().endpoint, SESSION) as connection:
+        yield connection
 
 
-@pytest.mark.parametrize("force_n", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.8, 0.8)])
-def test_a_force_that_is_not_finite_or_beyond_the_limit_is_not_to_be_rendered(
-    force_n: tuple[float, ...],
+def press_until_a_force(tool: Tool) -> tuple[float, float, float]:
+    for _ in steps(60.0, 0.001):
+        tool.move(tool.at_depth(0.002))
+        if any(force := tool.take_force()):
+            return force
+    raise AssertionError("no force in 60 s")
+
+
+def test_a_tool_is_held_from_entering_to_leaving_and_its_force_points_out_of_the_tissue(
+    serve: Callable[..., Any], connect: Callable[..., Any]
 ) -> None:
-    said = Conversation()
-    newest = said.go_well(100, 200)
-    assert said.tick(200, newest, force_n=(0.0, 0.6, 0.6))
-    assert not said.tick(201, newest, force_n=force_n)
-    assert "tick 201: the force" in said.contract.broken[0]
-    assert said.tick(203, newest)
-    assert not said.tick(202, newest)  # from before
+    served = serve()
+    with connect(served.endpoint) as observer, Connection(served.endpoint, SESSION) as connection:
+        with Tool(connection) as tool:
+            assert tool.take_force() == (0.0, 0.0, 0.0)
+            force = press_until_a_force(tool)
+            assert sum(f * n for f, n in zip(force, tool.normal, strict=True)) > 0
+            assert observer.next_status()["tools"]["tip"]["holder"] == connection.name
+        assert observer.next_status()["tools"]["tip"]["holder"] is None
+        assert tool.contract.broken == []
+        assert tool.take_force() == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said_of_it"),
-    [
-        ({"force_n": [[1.01, 0.0, 0.0]]}, "the limit 1.0 N"),
-        ({"force_n": [[math.nan, 0.0, 0.0]]}, "is not finite"),
-        ({"force_n": [[-0.9, 0.0, 0.0]]}, "jumped by 1.8"),
-        ({"flags": [int(Flags.STALE)]}, "the input is stale"),
-        ({"input_age_ns": [HOLD_NS + 2 * MS]}, "no flag says so"),
-        ({"tick": 199}, "it came after tick 200"),
-        ({"sequence": [90], "client_time_ns": [189 * MS]}, "the tick before answered 98"),
-        ({"sequence": [1000]}, "we no longer hold the contact: it answers command 1000"),
-        ({"client_time_ns": [77]}, "we no longer hold the contact: it answers command 98"),
-        ({"sequence": [-1]}, "we no longer hold the contact, our commands are forgotten"),
-    ],
-)
-def test_a_force_that_breaks_the_contract_in_any_way_is_not_to_be_rendered_but_the_next_good_one_is(
-    wrong: dict[str, Any], said_of_it: str
+def test_a_frame_turns_positions_and_forces(connection: Connection) -> None:
+    """The client's z axis is the outward normal; 1 mm at the client is 2 mm in the model; its origin is the tool's start."""
+    described = connection.description.tools[0]
+    z = described.normal
+    x = (z[1], z[2], z[0])  # at right angles for a normal along an axis, as the sample's
+    y = tuple(z[i - 2] * x[i - 1] - z[i - 1] * x[i - 2] for i in range(3))
+    rotation = tuple(zip(x, y, z, strict=True))
+    frame = Frame(rotation, scale=2.0, client_origin_m=(0.1, 0.0, 0.0), model_origin_m=described.start_m)  # type: ignore[arg-type]
+    with Tool(connection, frame=frame) as tool:
+        assert tool.home_m == pytest.approx((0.1, 0.0, 0.0))
+        assert tool.normal == pytest.approx((0.0, 0.0, 1.0))
+        fx, fy, fz = press_until_a_force(tool)
+        assert fz > 10 * (abs(fx) + abs(fy))
+
+
+def test_refusals_are_the_servers_words(connection: Connection, serve: Callable[..., Any]) -> None:
+    with pytest.raises(ValueError, match="no tool is called 'tap': there are tip"):
+        Tool(connection, "tap")
+    with Tool(connection), Connection(connection.place, SESSION) as other:
+        with pytest.raises(Refused, match="is held by client") as caught, Tool(other):
+            pass
+        assert caught.value.reason == "held"
+
+
+def test_a_tool_that_somebody_releases_is_lost(
+    serve: Callable[..., Any], connect: Callable[..., Any]
 ) -> None:
-    said = Conversation()
-    said.go_well(100, 200)
-    good = {
-        "tick": 200,
-        "sequence": [98],
-        "client_time_ns": [said.sent_ms[98] * MS],
-        "input_age_ns": [2 * MS],
-        "flags": [0],
-        "force_n": [[0.9, 0.0, 0.0]],
-    }
-    assert said.contract.on_force(good, 200 * MS)
-    assert not said.contract.on_force(good | {"tick": 201} | wrong, 201 * MS)
-    (broken,) = said.contract.broken
-    assert said_of_it in broken
-    assert said.contract.holding is ("no longer" not in broken)
-    said.contract.agree({"limits": LIMITS})
-    assert said.contract.on_force(good | {"tick": 202, "force_n": [[0.05, 0.0, 0.0]]}, 202 * MS)
-    assert len(said.contract.broken) == 1
+    served = serve()
+    with (
+        connect(served.endpoint) as observer,
+        Connection(served.endpoint, SESSION) as connection,
+        pytest.raises(ToolLost, match="our commands are forgotten"),
+        Tool(connection) as tool,
+    ):
+        press_until_a_force(tool)
+        assert observer.query(f"control/{connection.name}/release", RELEASE)[0]
+        for _ in steps(60.0, 0.001):
+            tool.move(tool.at_depth(0.002))
 
 
-def test_round_trips_are_measured_anew_and_answers_counted_on() -> None:
-    said = Conversation()
-    said.go_well(100, 200)
-    said.contract.measure_anew()
-    assert said.contract.summary()["round_trip_s"]["p50"] is None
-    said.go_well(200, 250)
-    summary = said.contract.summary()
-    assert summary["round_trip_s"]["p50"] == pytest.approx(2e-3)
-    assert summary["commands_answered"] == 98 + 49
+def test_after_a_server_that_came_back_a_tool_is_acquired_again_but_not_with_another_model(
+    serve: Callable[..., Any], start: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serve()
+    other = tmp_path / "other.npz"
+    save_model(replace(served.model, config_sha256="f" * 64), other)
+    server = served.program
+    with Connection(served.endpoint, SESSION) as connection:
+        for model in (tmp_path / "model1.npz", other):
+            with pytest.raises(ServerGone), Tool(connection) as tool:
+                press_until_a_force(tool)
+                server.process.kill()
+                server.process.wait()
+                for _ in steps(60.0, 0.001):
+                    tool.move(tool.at_depth(0.002))
+            assert tool.take_force() == (0.0, 0.0, 0.0)
+            place = ("--listen", served.endpoint, "--session", SESSION)
+            server = start("-m", "palpate_server", model, *place, ready="serving")
+            if model == other:
+                with pytest.raises(Incompatible, match="another model"):
+                    connection.reconnect(60.0)
+            else:
+                connection.reconnect(60.0)
 
 
-def test_a_client_whose_commands_are_forgotten_has_lost_its_contact() -> None:
-    said = Conversation()
-    said.go_well(100, 200)
-    assert said.contract.holding
-    assert not said.contract.broken
-    said.tick(200, -1)
-    said.tick(201, -1)
-    assert not said.contract.holding
-    (broken,) = said.contract.broken
-    assert "tick 200: we no longer hold the contact" in broken
+def test_a_message_of_another_kind_than_its_keys_is_ignored(
+    serve: Callable[..., Any], connect: Callable[..., Any], wait_for: Callable[..., Any]
+) -> None:
+    served = serve()
+    with (
+        connect(served.endpoint) as observer,
+        Connection(served.endpoint, SESSION) as connection,
+        Tool(connection) as tool,
+    ):
+        press_until_a_force(tool)
+        for payload in (b"\xc1", msgpack.packb(observer.statuses[-1])):
+            observer.session.put(observer.key("force"), payload)
+        wait_for(lambda: connection.ignored, "ignored messages", lambda ignored: ignored == 2)
+        assert any(press_until_a_force(tool))
 
 
-def test_before_the_first_answer_and_after_a_release_no_command_of_ours_is_known_rightly() -> None:
-    said = Conversation()
-    said.send(100)
-    said.tick(100, -1)
-    said.go_well(101, 200)
-    said.contract.release()
-    said.tick(200, -1)
-    assert not said.contract.broken
+def test_a_server_of_version_1_is_told_from_one_that_does_not_answer() -> None:
+    endpoint = free_endpoint()
+    with transport.open_session(endpoint, None) as server:
+        old = msgpack.packb({"schema_version": 1})
+        server.declare_queryable("palpate/test/describe", lambda query: query.reply(query.key_expr, old))
+        token = server.liveliness().declare_token("palpate/test/server")
+        with (
+            pytest.raises(Incompatible, match="schema version 1, this client 2"),
+            Connection(endpoint, SESSION),
+        ):
+            pass
+        token.undeclare()
+        with pytest.raises(ServerGone, match="no server for palpate/test"), Connection(endpoint, SESSION):
+            pass
 
 
-def test_a_client_that_goes_on_sending_for_a_second_while_its_force_has_faded_is_not_heard() -> None:
-    said = Conversation()
-    newest = said.go_well(100, 200)
-    for now in range(200, 1300):
-        if now % 60 > 40:  # with pauses that let no force fade
-            said.send(now)
-        said.tick(now, newest)
-    assert said.contract.holding  # perhaps: nobody has said otherwise
-    (broken,) = said.contract.broken
-    assert "went on sending" in broken
+def test_the_first_program_prints_a_force_that_pushes_out(
+    serve: Callable[..., Any], start: Callable[..., Any], tmp_path: Path
+) -> None:
+    text = (EXAMPLES / "first_program.py").read_text()
+    assert len(text.splitlines()) <= 25
+    served = serve("--session", "main")
+    script = tmp_path / "first_program.py"
+    script.write_text(text.replace("tcp/127.0.0.1:7447", served.endpoint))
+    code, out, err = start(script).finish()
+    assert (code, err) == (0, "")
+    last = [float(number) for number in re.findall(r"[+-][\d.]+", out.splitlines()[-1])]
+    normal = served.model.contacts[0].normal
+    assert sum(f * n for f, n in zip(last, normal, strict=True)) > 0
 
 
-def test_commands_that_are_held_up_for_longer_than_a_force_takes_to_fade_break_no_promise() -> None:
-    said = Conversation()
-    newest = said.go_well(100, 200)
-    for now in range(200, 400):
-        said.send(now)
-        said.tick(now, newest)
-    said.go_well(400, 500)
-    assert Flags.STALE.name in said.contract.summary()["flags"]
-    assert not said.contract.broken
-
-
-def test_a_client_that_was_silent_itself_finds_nothing_wrong_with_a_faded_force() -> None:
-    said = Conversation()
-    newest = said.go_well(100, 200)
-    for now in range(200, 2000):  # it sends nothing, but hears
-        said.tick(now, newest)
-    said.go_well(2000, 2100)
-    assert not said.contract.broken
-
-
-@pytest.mark.parametrize("sent_first", [1, 2000])
-def test_a_client_that_was_paused_finds_nothing_wrong_with_what_it_missed(sent_first: int) -> None:
-    """What came while it could not listen it hears afterwards, when it has sent commands again."""
-    said = Conversation()
-    newest = said.go_well(100, 200)
-    for now in range(2000, 2000 + sent_first):
-        said.send(now)
-    for now in range(200, 2001):
-        said.tick(now, newest, heard_ms=2000 + sent_first)
-    assert not said.contract.broken
+def test_a_program_that_fails_inside_a_connection_ends(
+    serve: Callable[..., Any], start: Callable[..., Any], tmp_path: Path
+) -> None:
+    """Python would wait for Zenoh's threads if the session was not closed."""
+    script = tmp_path / "fails.py"
+    script.write_text(
+        "import sys\nfrom palpate_client import Connection, Tool\n"
+        f"with Connection({serve().endpoint!r}, 'test') as connection, Tool(connection):\n    sys.exit(3)\n"
+    )
+    assert start(script).finish()[0] == 3
 
 
 # The clients as a user runs them.
@@ -240,7 +222,7 @@ def test_a_client_that_was_paused_finds_nothing_wrong_with_what_it_missed(sent_f
 def holder_when_poking(observer: Any) -> str:
     """The name of the client at the tip, once it feels its force in full."""
     observer.force_when(lambda force: force["force_scale"][0] == 1, "the force in full")
-    return str(observer.next_status()["contacts"]["tip"]["holder"])
+    return str(observer.next_status()["tools"]["tip"]["holder"])
 
 
 def test_a_client_whose_contact_is_released_by_another_fails_and_tells_the_servers_count(
@@ -248,12 +230,12 @@ def test_a_client_whose_contact_is_released_by_another_fails_and_tells_the_serve
 ) -> None:
     served = serve()
     with connect(served.endpoint) as observer:
-        client = run_example("headless_client.py", served.endpoint, "--duration-s", "60", "--json")
+        client = run_example("palpate_client.poke", served.endpoint, "--duration-s", "60", "--json")
         name = holder_when_poking(observer)
-        assert observer.query(f"control/{name}/release")[0]
+        assert observer.query(f"control/{name}/release", RELEASE)[0]
         code, out, err = client.finish()
     assert code == 1
-    assert "we no longer hold the contact" in err
+    assert "we no longer hold the tool" in err
     summary = json.loads(out)
     assert len(summary["contract_broken"]) == 1
     assert summary["server_lost"] is None
@@ -261,15 +243,16 @@ def test_a_client_whose_contact_is_released_by_another_fails_and_tells_the_serve
     assert summary["not_carried_out"].get("refused not_holder", 0) > 0
 
 
-def test_a_client_that_pauses_for_half_a_second_goes_on_and_the_contract_holds(
+def test_a_client_that_pauses_until_its_force_has_faded_goes_on_and_the_contract_holds(
     serve: Callable[..., Any], run_example: Callable[..., Any], connect: Callable[..., Any]
 ) -> None:
     served = serve()
     with connect(served.endpoint) as observer:
-        client = run_example("headless_client.py", served.endpoint, "--duration-s", "2", "--json")
+        client = run_example("palpate_client.poke", served.endpoint, "--duration-s", "2", "--json")
         observer.force_when(lambda force: force["force_n"][0] != [0, 0, 0], "a force")
         client.process.send_signal(signal.SIGSTOP)
-        time.sleep(0.5)  # after a second of silence the server would take the contact back
+        # When the force has faded, well before the server would take the tool back.
+        observer.force_when(lambda force: force["flags"][0] & Flags.STALE, "a faded force")
         client.process.send_signal(signal.SIGCONT)
         code, out, err = client.finish()
     summary = json.loads(out)
@@ -284,11 +267,11 @@ def test_a_summary_says_what_became_of_the_commands_and_no_more(
     served = serve()
     # Three in a period: two of them replace each other unused.
     options = ("--duration-s", "0.5", "--rate-hz", "3000")
-    code, out, err = run_example("headless_client.py", served.endpoint, *options, "--json").finish()
+    code, out, err = run_example("palpate_client.poke", served.endpoint, *options, "--json").finish()
     assert code == 0, err
     summary = json.loads(out)
     assert set(summary["not_carried_out"]) == {"superseded"}
-    code, out, err = run_example("headless_client.py", served.endpoint, *options).finish()
+    code, out, err = run_example("palpate_client.poke", served.endpoint, *options).finish()
     assert code == 0, err
     assert re.search(r"not carried out +superseded \d+", out)
 
@@ -412,15 +395,12 @@ def test_a_bridge_that_was_held_up_when_the_server_stopped_says_that_it_stops(
     serve: Callable[..., Any],
     run_bridge_until_a_force: Callable[..., Bridge],
     monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
 ) -> None:
     """Its loop learns at once that the server stops and that it is gone."""
-    monkeypatch.setenv("HELD_UP_UNTIL", str(go_on := tmp_path / "go_on"))
+    monkeypatch.setenv("HOLD_UP", "until the server's stop is known")
     served = serve()
     bridge = run_bridge_until_a_force(served.endpoint)
     assert served.stop() == 0
-    time.sleep(0.5)  # until the bridge has heard it
-    go_on.touch()
     code, _, err = bridge.program.finish()
     assert code == 1
     assert "the server is stopping" in err
@@ -436,10 +416,10 @@ def test_the_motors_are_left_without_a_force_when_the_contact_is_lost(
     served = serve()
     with connect(served.endpoint) as observer:
         bridge = run_bridge_until_a_force(served.endpoint, "--name", "bridge")
-        assert observer.query("control/bridge/release")[0]
+        assert observer.query("control/bridge/release", RELEASE)[0]
         code, _, err = bridge.program.finish()
     assert code == 1
-    assert "we no longer hold the contact" in err
+    assert "we no longer hold the tool" in err
     assert bridge.last_force() == 0
 
 
@@ -452,19 +432,21 @@ def test_while_no_force_comes_none_is_rendered_until_the_tip_has_left_the_tissue
     bridge = run_bridge_until_a_force(served.endpoint)
     served.process.send_signal(signal.SIGSTOP)
     try:
-        # Its token is there for another second, when the bridge would end: it is the silence that is noticed.
-        time.sleep(0.05)
-        silent = len(bridge.rendered())
+        # Its token is there for some seconds more, when the bridge would end: it is the silence that is noticed.
+        stopped = len(bridge.rendered())
 
-        def let_go(rendered: list[tuple[float, float]]) -> bool:
-            return any(position > 0 and force == 0 for position, force in rendered[silent:])
+        def let_go() -> int | None:
+            rendered = bridge.rendered()
+            return next(
+                (i for i in range(stopped, len(rendered)) if rendered[i][0] > 0 == rendered[i][1]), None
+            )
 
-        wait_for(bridge.rendered, "no force in the tissue", let_go)
+        since = wait_for(let_go, "no force in the tissue")
     finally:
         served.process.send_signal(signal.SIGCONT)
-    wait_for(lambda: any(force for _, force in bridge.rendered()[silent:]), "a force again")
+    wait_for(lambda: any(force for _, force in bridge.rendered()[since:]), "a force again")
     assert bridge.program.process.poll() is None
-    positions, forces = zip(*bridge.rendered()[silent:], strict=True)
+    positions, forces = zip(*bridge.rendered()[since:], strict=True)
     assert min(positions[: next(i for i, force in enumerate(forces) if force)]) <= 0
 
 
@@ -483,7 +465,7 @@ def test_a_recording_that_cannot_be_written_does_not_cost_the_summary(
     serve: Callable[..., Any], run_example: Callable[..., Any]
 ) -> None:
     options = ("--duration-s", "0.5", "--json", "--record", "/dev/full")
-    code, out, err = run_example("headless_client.py", serve().endpoint, *options).finish()
+    code, out, err = run_example("palpate_client.poke", serve().endpoint, *options).finish()
     assert code == 3
     assert json.loads(out)["contract_broken"] == []
     assert err.strip() == "palpate client: /dev/full: No space left on device"
@@ -503,7 +485,7 @@ def test_what_cannot_be_connected_with_is_told_from_a_server_that_is_not_there(
         assert err.startswith(f"device bridge: {said}")
 
 
-@pytest.mark.parametrize("script", ["headless_client.py", "device_bridge.py"])
+@pytest.mark.parametrize("script", ["palpate_client.poke", "device_bridge.py"])
 def test_a_name_that_no_key_can_have_is_refused_at_once(run_example: Callable[..., Any], script: str) -> None:
     names = ["a*", "a/b", "", "x" * 65]
     for client in [run_example(script, "tcp/127.0.0.1:1", "--name", name) for name in names]:
@@ -519,7 +501,7 @@ def test_a_client_is_interrupted_while_it_connects(run_example: Callable[..., An
         silent.bind(("127.0.0.1", 0))
         silent.listen()
         silent.settimeout(60)
-        for script in ("headless_client.py", "device_bridge.py"):
+        for script in ("palpate_client.poke", "device_bridge.py"):
             clients.append(run_example(script, f"tcp/127.0.0.1:{silent.getsockname()[1]}"))
             connections.append(silent.accept()[0])
             clients[-1].process.send_signal(signal.SIGINT)

@@ -18,21 +18,25 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
-from palpate_client_examples.contract import Contract
 
-from palpate_server.realtime.safety import DECAY_NS, HOLD_NS, Flags
+from palpate_client import Contract, Force
+from palpate_client.messages import read_description
+from palpate_client.wire import Flags
 
 SOURCE = Path(__file__).parents[2] / "client_examples" / "cpp"
+RELEASE = {"kind": "request", "schema_version": 2}
 MS = 1_000_000
+HOLD_NS, DECAY_NS = 20 * MS, 50 * MS
 PATIENCE_S = 60.0  # what is waited for comes much sooner
 PROMISE = {
-    "contacts": [{"name": "tip"}],
-    "flags": {flag.name: flag.value for flag in Flags},
+    "tools": [{"name": "tip", "start_m": [0.0] * 3, "normal": [0.0, 0.0, 1.0], "radius_m": 0.01}],
     "limits": {"max_force_n": 1.0, "max_force_rate_n_per_s": 1000.0},
     "period_s": 1e-3,
     "hold_s": HOLD_NS * 1e-9,
     "decay_s": DECAY_NS * 1e-9,
+    "model": {"config_sha256": "0"},
 }
 
 # Reads what is done to a contract, a gate or a queue, and prints what they say of it.
@@ -138,8 +142,8 @@ class Device : public SimulatedDevice {{
         std::fflush(file_);
         SimulatedDevice::render(force_n);
         pushes_ = force != 0;
-        const char* held_up_until = std::getenv("HELD_UP_UNTIL");
-        while (pushes_ && held_up_until && access(held_up_until, F_OK)) usleep(10'000);
+        const char* hold_up = std::getenv("HELD_UP_UNTIL");
+        while (pushes_ && hold_up && access(hold_up, F_OK)) usleep(10'000);
     }}
     Vec3 position_m() const {{
         if (pushes_ && fails_ == "logic_error") throw std::logic_error("the encoder is upside down");
@@ -195,19 +199,19 @@ def listen(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
 
 
 def troubled_conversation(seed: int) -> list[tuple[Any, ...]]:
-    """Three seconds of commands and ticks, in which now and then something is not as it should be."""
+    """Six seconds of commands and ticks, in which now and then something is not as it should be."""
     dice = random.Random(seed)
     said: list[tuple[Any, ...]] = [("agree",)]
     sent: dict[int, int] = {}
     tick, force = 1000, 0.0
     reached = silent_until = 0
-    for now in range(1, 3000):
-        if now >= silent_until and dice.random() < 0.002:
-            silent_until = now + dice.choice((10, 60, 200, 1200))
+    for now in range(1, 6000):
+        if seed % 4 and now >= silent_until and dice.random() < 0.002:
+            silent_until = now + dice.choice((10, 60, 200, 4500))
         if now >= silent_until:
             sent[len(sent) + 1] = now * MS
             said.append(("sent", len(sent), now * MS))
-        # Two milliseconds later its answer comes; in every fourth conversation only the first ones are heard.
+        # Two milliseconds later its answer comes; in every fourth conversation, without pauses, only the first ones are heard.
         while reached < len(sent) and sent[reached + 1] <= (now - 2) * MS:
             reached += 1
         newest = min(reached, 10_000 if seed % 4 else 300) or -1
@@ -246,26 +250,31 @@ def troubled_conversation(seed: int) -> list[tuple[Any, ...]]:
 
 
 def in_python(said: list[tuple[Any, ...]]) -> tuple[list[float], str, list[str]]:
-    contract = Contract(PROMISE, "tip")
+    contract = Contract(read_description(PROMISE))
     may_be_rendered = ""
     for word, *values in said:
         if word == "agree":
-            contract.agree({"limits": PROMISE["limits"]})
+            contract.acquired(1.0)
         elif word == "release":
-            contract.release()
+            contract.released()
         elif word == "sent":
-            contract.on_sent({"sequence": values[0], "client_time_ns": values[1]})
+            contract.on_sent(*values)
         else:
-            tick, sequence, client_time_ns, input_age_ns, flags, force, arrival_ns = values
-            message = {
-                "tick": tick,
-                "sequence": [sequence],
-                "client_time_ns": [client_time_ns],
-                "input_age_ns": [input_age_ns],
-                "flags": [flags],
-                "force_n": [[force, 0.0, 0.0]],
-            }
-            may_be_rendered += "1" if contract.on_force(message, arrival_ns) else "0"
+            tick, sequence, client_time_ns, input_age_ns, flags, x, arrival_ns = values
+            message = Force(
+                tick,
+                0,
+                sequence,
+                client_time_ns,
+                input_age_ns,
+                flags,
+                (),
+                (x, 0.0, 0.0),
+                1.0,
+                0.0,
+                arrival_ns,
+            )
+            may_be_rendered += "1" if contract.on_force(message) else "0"
     summary = contract.summary()
     trips = summary["round_trip_s"]
     counts = [
@@ -412,6 +421,10 @@ class Run:
         pairs = [line.split() for line in lines if line.endswith("\n")]
         return [(float(position), float(force)) for position, force in pairs]
 
+    def is_connected(self) -> bool:
+        connections = psutil.Process(self.process.pid).net_connections("tcp")
+        return any(connection.status == psutil.CONN_ESTABLISHED for connection in connections)
+
     def device_was_closed(self) -> bool:
         return self.rendered.with_name("rendered.closed").exists()
 
@@ -486,7 +499,7 @@ def test_a_signal_leaves_the_motors_without_a_force_and_the_contact_free(
         run.wait_for_a_force()
         run.process.send_signal(number)
         code, out, err = run.finish()
-        assert observer.next_status()["contacts"]["tip"]["holder"] is None
+        assert observer.next_status()["tools"]["tip"]["holder"] is None
     assert code == 130, err
     assert re.search(r"contract +held", out)
     assert run.forces()[-1] == 0
@@ -512,7 +525,7 @@ def test_a_signal_while_the_bridge_waits_for_a_server_to_come_again_closes_the_d
     run.wait_for_a_force()
     served.process.kill()
     run.wait_for_none()
-    time.sleep(0.5)
+    run.wait_for(lambda: not run.is_connected(), "end of the connection")
     run.process.send_signal(signal.SIGTERM)
     code, _, err = run.finish()
     assert code == 130, err
@@ -578,7 +591,7 @@ def test_a_bridge_that_was_held_up_when_the_server_stopped_says_that_it_stops(
     run = run_bridge(served.endpoint, "--duration-s", "60")
     run.wait_for_a_force()
     assert served.stop() == 0
-    time.sleep(0.5)  # until the bridge has heard it
+    run.wait_for(lambda: not run.is_connected(), "end of the connection")  # then the stop was received
     go_on.touch()
     code, _, err = run.finish()
     assert code == 1
@@ -594,10 +607,10 @@ def test_a_lost_contact_leaves_the_motors_without_a_force(
     with connect(served.endpoint) as observer:
         run = run_bridge(served.endpoint, "--duration-s", "60", "--name", "bridge")
         run.wait_for_a_force()
-        assert observer.query("control/bridge/release")[0]
+        assert observer.query("control/bridge/release", RELEASE)[0]
         code, _, err = run.finish()
     assert code == 1
-    assert "we no longer hold the contact" in err
+    assert "we no longer hold the tool" in err
     assert run.forces()[-1] == 0
 
 
@@ -670,6 +683,6 @@ def test_what_can_not_be_is_said_at_once(
 def test_a_contact_that_is_not_there_is_refused_with_those_that_are(
     serve: Callable[..., Any], run_bridge: Callable[..., Run]
 ) -> None:
-    code, _, err = run_bridge(serve().endpoint, "--contact", "tap").finish()
+    code, _, err = run_bridge(serve().endpoint, "--tool", "tap").finish()
     assert code == 2
-    assert "no contact is called 'tap': there are tip" in err
+    assert "no tool is called 'tap': there are tip" in err

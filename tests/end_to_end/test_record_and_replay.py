@@ -46,7 +46,7 @@ def test_a_recording_is_complete_after_sigterm_and_repeats_bit_for_bit(
         served = serve()
         out = tmp_path / f"{attempt}.mcap"
         recorder = start_recorder(out, served.endpoint)
-        code, _, err = run_example("headless_client.py", served.endpoint, "--duration-s", "1").finish()
+        code, _, err = run_example("palpate_client.poke", served.endpoint, "--duration-s", "1").finish()
         assert code == 0, err
         assert recorder.stop() == 0
         assert "messages in" in recorder.printed()
@@ -153,7 +153,7 @@ def test_a_recording_that_a_client_asks_for_has_every_tick_and_command_and_repea
     with connect(served.endpoint) as client:
         assert client.record("a.mcap") == {"file": "a.mcap"}
         assert client.control("record", {"file": "b.mcap"})[1]["reason"] == "busy"
-        code, _, err = run_example("headless_client.py", served.endpoint, "--duration-s", "1").finish()
+        code, _, err = run_example("palpate_client.poke", served.endpoint, "--duration-s", "1").finish()
         assert code == 0, err
         heard = client.next_status()
         running = heard["recording"]
@@ -261,7 +261,7 @@ def test_a_server_that_ends_while_it_records_leaves_a_complete_file(
     path = tmp_path / "a.mcap"
     with connect(served.endpoint) as client:
         client.record("a.mcap")
-        run_example("headless_client.py", served.endpoint, "--duration-s", "60")
+        run_example("palpate_client.poke", served.endpoint, "--duration-s", "60")
         client.force_when(lambda force: force["force_scale"][0] == 1.0, "the force in full")
         heard = client.next_status()
         wait_for(

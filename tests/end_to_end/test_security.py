@@ -23,7 +23,6 @@ from palpate_server.diagnostics.round_trips import free_endpoint
 from palpate_server.diagnostics.sample_model import spring_mass_model
 
 EXAMPLE = Path(__file__).parents[2] / "configs" / "security"
-CLIENT = Path(__file__).parents[2] / "client_examples" / "headless_client.py"
 KEYS = wire.Keys("main")
 
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificates")
@@ -128,7 +127,7 @@ def connect_as(connect: Callable[..., Any], folder: Path) -> Callable[..., Any]:
 def run_client(start: Callable[..., Any]) -> Callable[[Path, str], Any]:
     def run_client(folder: Path, who: str) -> Any:
         options = ("--zenoh-config", folder / f"{who}.json5", "--name", who, "--silence-s", "30")
-        return start(CLIENT, *options, "--duration-s", "1", "--json")
+        return start("-m", "palpate_client.poke", *options, "--duration-s", "1", "--json")
 
     return run_client
 

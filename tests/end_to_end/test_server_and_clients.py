@@ -60,7 +60,7 @@ def test_forces_through_the_wire_are_the_models_response_to_the_applied_displace
     with connect(served.endpoint) as client:
         client.record("ticks.mcap")
         options = ("--duration-s", "2", "--json", "--record", str(heard))
-        code, out, err = run_example("headless_client.py", served.endpoint, *options).finish()
+        code, out, err = run_example("palpate_client.poke", served.endpoint, *options).finish()
         assert code == 0, err
         assert client.control("record", {"file": None})[1]["error"] is None
     summary = json.loads(out)
@@ -111,7 +111,7 @@ def test_force_is_zero_within_a_tenth_of_a_second_after_the_client_is_killed(
         for _ in range(
             5
         ):  # on a busy machine its last commands, or the ticks, may come late, but not each time
-            client = run_example("headless_client.py", served.endpoint, *slow)
+            client = run_example("palpate_client.poke", served.endpoint, *slow)
             observer.force_when(lambda force: in_full(force) and np.any(force["force_n"]), "the force")
             killed_ns = time.monotonic_ns()
             client.process.kill()
@@ -134,7 +134,7 @@ def test_a_client_that_pauses_for_half_a_second_is_faded_out_and_softly_in_again
     served = serve("--recordings", str(tmp_path))
     slow = ("--duration-s", "60", "--frequency-hz", "0.5")
     with connect(served.endpoint) as observer:
-        client = run_example("headless_client.py", served.endpoint, *slow)
+        client = run_example("palpate_client.poke", served.endpoint, *slow)
         observer.force_when(in_full, "the force in full")
         assert observer.control("record", {"file": "pause.mcap"})[0]
         client.process.send_signal(signal.SIGSTOP)
@@ -168,7 +168,7 @@ def test_a_killed_server_is_named_by_the_client_which_fails(
 ) -> None:
     served = serve()
     with connect(served.endpoint) as observer:
-        client = run_example("headless_client.py", served.endpoint, "--duration-s", "60")
+        client = run_example("palpate_client.poke", served.endpoint, "--duration-s", "60")
         observer.force_when(in_full, "the force in full")
         served.process.kill()
         code, _, err = client.finish()
@@ -177,7 +177,7 @@ def test_a_killed_server_is_named_by_the_client_which_fails(
 
 
 def test_a_client_without_a_server_says_so(run_example: Callable[..., Any]) -> None:
-    code, _, err = run_example("headless_client.py", free_endpoint(), "--duration-s", "1").finish()
+    code, _, err = run_example("palpate_client.poke", free_endpoint(), "--duration-s", "1").finish()
     assert code == 2
     assert "palpate client:" in err
 
@@ -629,7 +629,7 @@ def test_a_killed_client_leaves_a_black_box_behind(
     folder = tmp_path / "boxes"
     served = serve("--black-box", str(folder))
     with connect(served.endpoint) as observer:
-        client = run_example("headless_client.py", served.endpoint, "--duration-s", "60")
+        client = run_example("palpate_client.poke", served.endpoint, "--duration-s", "60")
         observer.force_when(in_full, "the force in full")
         client.process.kill()
         (path,) = wait_for(lambda: list(folder.glob("*-lost.npz")), "a black box")

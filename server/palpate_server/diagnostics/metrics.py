@@ -6,16 +6,14 @@ python -m palpate_server.diagnostics.metrics [--connect ENDPOINT] [--session NAM
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
-from palpate_client import wire
+from palpate_client import ClientError
+from palpate_client.arguments import add_connection_options, connection_for
 from palpate_server.arguments import need, port
-from palpate_server.session import transport
 
 if __name__ == "__main__":
     need("prometheus_client", "metrics", "palpate_server.diagnostics.metrics")
@@ -85,36 +83,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="palpate_server.diagnostics.metrics", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument(
-        "--connect", default=transport.DEFAULT_ENDPOINT, metavar="ENDPOINT", help="(%(default)s)"
-    )
-    parser.add_argument("--session", default="main", help="(%(default)s)")
-    parser.add_argument("--zenoh-config", type=Path, metavar="FILE", help="used instead of --connect")
+    add_connection_options(parser, name=False)
     parser.add_argument("--address", default="127.0.0.1", help="to listen on (%(default)s)")
     parser.add_argument("--port", type=port, default=9464, help="to listen on (%(default)s)")
     options = parser.parse_args(arguments)
     collector = StatusCollector()
+    came = threading.Event()
+
+    def on_status(status: dict[str, Any]) -> None:
+        collector.status = status
+        came.set()
+
     try:
-        keys = wire.Keys(options.session)
-        with transport.connect_session(options.connect, options.zenoh_config) as session:
-            heard = threading.Event()
-
-            def on_status(sample: Any) -> None:
-                with contextlib.suppress(wire.MalformedMessage):
-                    collector.status = wire.unpack(sample.payload.to_bytes(), wire.Kind.STATUS)
-                    heard.set()
-
-            session.declare_subscriber(keys.status, on_status)  # for as long as the session
+        with connection_for(options) as connection:
+            connection.on_status(on_status)
             REGISTRY.register(collector)
             start_http_server(options.port, options.address)
-            print(f"metrics of {keys.prefix} on http://{options.address}:{options.port}/metrics", flush=True)
+            url = f"http://{options.address}:{options.port}/metrics"
+            print(f"metrics of {connection.keys.prefix} on {url}", flush=True)
             while True:  # until Ctrl-C
-                if not heard.wait(1.0):
-                    collector.status = None  # what was true is no longer known
-                heard.clear()
+                if not came.wait(1.0):
+                    collector.status = None  # the last one may no longer hold
+                came.clear()
     except KeyboardInterrupt:
         return 0
-    except (OSError, ValueError, transport.TransportError) as error:
+    except (ClientError, OSError) as error:
         print(f"palpate_server.diagnostics.metrics: {error}", file=sys.stderr)
         return 2
 

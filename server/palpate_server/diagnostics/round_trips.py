@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import contextlib
-import socket
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgpack
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from palpate_client import wire
+from palpate_client import Connection, ServerGone
+from palpate_client.connection import open_session
+from palpate_client.local_server import free_endpoint, running
+from palpate_client.wire import Kind, MalformedMessage, pack, unpack
 from palpate_server.session import transport
 
 RATE_HZ = 1000
 SETTLE_S = 1.0  # the server's deadlines need a quarter of a second to settle behind the commands
-_START_S = 60.0
-_CLIENT = "round-trips"
+_STEP_M = (0.001, 0.002, -0.003)  # from where the tool is at rest
 
 
 @dataclass(frozen=True)
@@ -119,27 +118,23 @@ def ping_pong(command_bytes: int, force_bytes: int, seconds: float) -> RoundTrip
     """Against a Python peer in a process of its own that does nothing but put back `force_bytes` bytes."""
     endpoint = free_endpoint()
     command = [sys.executable, "-m", "palpate_server.diagnostics.round_trips", endpoint, str(force_bytes)]
-    with running(command, "ready"), transport.connect_session(endpoint, None) as session:
-        padding = bytes(command_bytes - 8)
-        return measure(
+    padding = bytes(command_bytes - 8)
+    answers: list[tuple[int, int]] = []
+    with running(command, "ready"), contextlib.closing(open_session(endpoint)) as session:
+        sent = _drive(
             session,
-            "ping",
-            "pong",
+            ("ping", "pong"),
             lambda sequence, now: sequence.to_bytes(8, "little") + padding,
-            lambda payload: int.from_bytes(payload[:8], "little"),
+            lambda arrival_ns, payload: answers.append((int.from_bytes(payload[:8], "little"), arrival_ns)),
             seconds,
         )
+    return _match(sent, answers)
 
 
 def pong(endpoint: str, size: int) -> None:
     """The peer of `ping_pong`; runs until it is killed."""
     with transport.open_session(endpoint, None) as session:
-        publisher = session.declare_publisher(
-            "pong",
-            priority=zenoh.Priority.REAL_TIME,
-            express=True,
-            congestion_control=zenoh.CongestionControl.DROP,
-        )
+        publisher = session.declare_publisher("pong", **_real_time())
         padding = bytes(size - 8)
         session.declare_subscriber("ping", lambda s: publisher.put(s.payload.to_bytes()[:8] + padding))
         print("ready", flush=True)
@@ -151,129 +146,87 @@ def through_a_model(
 ) -> tuple[RoundTrips, dict[str, Any]]:
     """Against a server of its own for the model in `path`, driven at one tool; and that server's last status.
 
-    With `viewer` the surface is listened to as well, 60 times a second and by the same process: more work for both.
+    With `viewer` the surface is received as well, 60 times a second and by the same process: more work for both.
     """
-    statuses: list[dict[str, Any]] = []
-    with _served(path, tool) as (session, keys):
-        if viewer:
-            session.declare_subscriber(keys.surface, lambda sample: None)
-        session.declare_subscriber(
-            keys.status, lambda sample: statuses.append(msgpack.unpackb(sample.payload.to_bytes()))
-        )
-        trips = measure(
-            session,
-            keys.command(_CLIENT),
-            keys.force,
-            lambda sequence, now: encode_command(tool, sequence, now),
-            lambda payload: int(msgpack.unpackb(payload)["sequence"][0]),
-            seconds,
-        )
-        return trips, statuses[-1]
+    sent, forces, status = _through_a_model(path, tool, seconds, viewer)
+    return _match(sent, [(force.sequence, force.arrival_ns) for force in forces]), status
 
 
 def trace_through_a_model(path: Path, tool: str, seconds: float) -> tuple[RoundTrips, Trace]:
     """The same without a viewer, at the model's first tool, and all that a device would have lived through meanwhile."""
-    heard: list[Heard] = []
-
-    def hear(arrival_ns: int, payload: bytes) -> None:
-        force = msgpack.unpackb(payload)
-        sequence, age_ns = force["sequence"][0], force["input_age_ns"][0]
-        heard.append(Heard(arrival_ns, force["tick"], force["server_time_ns"], sequence, age_ns))
-
-    with _served(path, tool) as (session, keys):
-        sent = _drive(
-            session,
-            keys.command(_CLIENT),
-            keys.force,
-            lambda sequence, now: encode_command(tool, sequence, now),
-            hear,
-            seconds,
-        )
+    sent, forces, _ = _through_a_model(path, tool, seconds, viewer=False)
     settled = int(SETTLE_S * RATE_HZ)
-    trips = _match(sent, [(force.sequence, force.arrival_ns) for force in heard])
-    return trips, trace_of(sent, heard).piece(settled, len(sent) - settled)
+    trips = _match(sent, [(force.sequence, force.arrival_ns) for force in forces])
+    return trips, trace_of(sent, forces).piece(settled, len(sent) - settled)
 
 
-@contextlib.contextmanager
-def _served(path: Path, tool: str) -> Iterator[tuple[zenoh.Session, wire.Keys]]:
-    """A session with a server of its own for the model in `path`, one tool of which it holds."""
+def _through_a_model(
+    path: Path, tool: str, seconds: float, viewer: bool
+) -> tuple[list[int], list[Heard], dict[str, Any]]:
+    """When each command was sent, ns, every force of the tool, and the last status."""
     endpoint = free_endpoint()
     command = [sys.executable, "-m", "palpate_server", str(path), "--listen", endpoint, "--surface-hz", "60"]
-    keys = wire.Keys("main")
-    with (
-        running(command, "serving"),
-        transport.connect_session(endpoint, None) as session,
-        holding(session, keys, tool),
-    ):
-        yield session, keys
+    forces: list[Heard] = []
+    statuses: list[dict[str, Any]] = []
+    with running(command, "serving"), Connection(endpoint) as connection:
+        index = connection.description.index(tool)
+        connection.on_status(statuses.append)
+        if viewer:
+            connection.on_surface(lambda surface: None)
+
+        def receive(arrival_ns: int, payload: bytes) -> None:
+            with contextlib.suppress(MalformedMessage):
+                force = unpack(payload, Kind.FORCE)
+                sequence, age_ns = force["sequence"][index], force["input_age_ns"][index]
+                forces.append(Heard(arrival_ns, force["tick"], force["server_time_ns"], sequence, age_ns))
+
+        acquired = connection.control("acquire", tools=[tool])["tools"][tool]
+        position_m = [home + step for home, step in zip(acquired["home_m"], _STEP_M, strict=True)]
+        sent = _drive(
+            connection.zenoh,
+            (connection.keys.command(connection.name), connection.keys.force),
+            lambda sequence, now: encode_command(tool, sequence, now, position_m),
+            receive,
+            seconds,
+        )
+    return sent, forces, statuses[-1]
 
 
-@contextlib.contextmanager
-def holding(session: zenoh.Session, keys: wire.Keys, tool: str) -> Iterator[None]:
-    """Hold a tool as the client of this module."""
-    token = session.liveliness().declare_token(keys.client(_CLIENT))
-    request = wire.pack({"kind": wire.Kind.REQUEST, "schema_version": wire.SCHEMA_VERSION, "tools": [tool]})
-    give_up = time.monotonic() + _START_S
-    acquire = keys.control(_CLIENT, "acquire")
-    while not any(reply.ok for reply in session.get(acquire, payload=request, timeout=2.0)):
-        if time.monotonic() > give_up:
-            raise transport.TransportError(f"tool {tool} could not be acquired")
-        time.sleep(0.05)
-    try:
-        yield
-    finally:
-        token.undeclare()  # type: ignore[no-untyped-call]
-
-
-def encode_command(tool: str, sequence: int, now_ns: int) -> bytes:
-    command = {
-        "kind": wire.Kind.COMMAND,
-        "sequence": sequence,
-        "client_time_ns": now_ns,
-        "position_m": {tool: [0.001, 0.002, -0.003]},
-    }
-    return wire.pack(command)
-
-
-def measure(
-    session: zenoh.Session,
-    send_key: str,
-    answer_key: str,
-    encode: Callable[[int, int], bytes],
-    answered: Callable[[bytes], int],
-    seconds: float,
-) -> RoundTrips:
-    """Send at RATE_HZ and match the answers by sequence; what is sent while settling is not counted."""
-    answers: list[tuple[int, int]] = []
-    sent = _drive(
-        session,
-        send_key,
-        answer_key,
-        encode,
-        lambda arrival_ns, payload: answers.append((answered(payload), arrival_ns)),
-        seconds,
+def encode_command(tool: str, sequence: int, now_ns: int, position_m: Sequence[float]) -> bytes:
+    return pack(
+        {
+            "kind": Kind.COMMAND,
+            "sequence": sequence,
+            "client_time_ns": now_ns,
+            "position_m": {tool: list(position_m)},
+        }
     )
-    return _match(sent, answers)
+
+
+def _real_time() -> dict[str, Any]:
+    return {
+        "priority": zenoh.Priority.REAL_TIME,
+        "express": True,
+        "congestion_control": zenoh.CongestionControl.DROP,
+    }
 
 
 def _drive(
     session: zenoh.Session,
-    send_key: str,
-    answer_key: str,
+    keys: tuple[str, str],
     encode: Callable[[int, int], bytes],
-    hear: Callable[[int, bytes], None],
+    receive: Callable[[int, bytes], None],
     seconds: float,
 ) -> list[int]:
-    """Send commands 1, 2, ... at RATE_HZ and hand on each answer with the time of its arrival; when each was sent, ns."""
+    """Send commands 1, 2, ... at RATE_HZ to one key and hand on each answer of another; when each was sent, ns.
+
+    What is sent while settling is measured too: `_match` leaves it out.
+    """
+    send_key, answer_key = keys
     subscriber = session.declare_subscriber(
-        answer_key, lambda sample: hear(time.monotonic_ns(), sample.payload.to_bytes())
+        answer_key, lambda sample: receive(time.monotonic_ns(), sample.payload.to_bytes())
     )
-    publisher = session.declare_publisher(
-        send_key,
-        priority=zenoh.Priority.REAL_TIME,
-        express=True,
-        congestion_control=zenoh.CongestionControl.DROP,
-    )
+    publisher = session.declare_publisher(send_key, **_real_time())
     time.sleep(0.5)
     sent = []
     start_s = time.monotonic()
@@ -290,49 +243,19 @@ def _drive(
 
 
 def _match(sent: Sequence[int], answers: Sequence[tuple[int, int]]) -> RoundTrips:
-    """sent: when command 1, 2, ... was; answers: of which command, and when it came; ns."""
+    """sent: when command 1, 2, ... was; answers: of which command, and when it came; ns. Raises ServerGone without any."""
     trips: dict[int, int] = {}
     for sequence, arrival_ns in answers:
         if sequence > SETTLE_S * RATE_HZ:
             trips.setdefault(sequence, arrival_ns - sent[sequence - 1])
     ordered = sorted(trips.values())
     if not ordered:
-        raise transport.TransportError("no command was answered")
+        raise ServerGone("no command was answered")
     return RoundTrips(
         p50_s=ordered[len(ordered) // 2] * 1e-9,
         p99_s=ordered[int(0.99 * len(ordered))] * 1e-9,
         unanswered=1 - len(ordered) / (len(sent) - int(SETTLE_S * RATE_HZ)),
     )
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-@contextlib.contextmanager
-def running(command: list[str], ready: str) -> Iterator[None]:
-    """A process, from the line that says that it is ready; it is ended whatever happens."""
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    watchdog = threading.Timer(_START_S, process.kill)
-    watchdog.start()
-    try:
-        assert process.stdout is not None
-        if not any(line.startswith(ready) for line in iter(process.stdout.readline, "")):
-            raise transport.TransportError(f"{' '.join(command[1:3])} did not start")
-        watchdog.cancel()
-        yield
-    finally:
-        watchdog.cancel()
-        process.terminate()
-        try:
-            process.wait(5)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
 
 
 if __name__ == "__main__":

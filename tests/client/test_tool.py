@@ -1,0 +1,56 @@
+"""A contact that is made one-sided: outside of the tissue nothing happens, and what was let go has to leave it first."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from palpate_client import OneSidedContact
+
+HOLD_S = 0.02
+
+
+class Hand:
+    """A hand over a tool whose home is the client's origin and whose normal is z."""
+
+    def __init__(self) -> None:
+        self.tool: Any = SimpleNamespace(home_m=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), silent_s=0.0)
+        self.contact = OneSidedContact(self.tool, HOLD_S)
+
+    def at(self, z: float, x: float = 0.0, silent_s: float = 0.0) -> tuple[list[float], bool]:
+        self.tool.silent_s = silent_s
+        return self.contact.tip((x, 0.0, z))
+
+
+def test_outside_of_the_tissue_the_tip_is_left_at_its_home() -> None:
+    assert Hand().at(0.01, x=0.3) == ([0.0, 0.0, 0.0], False)
+
+
+def test_inside_the_tip_moves_as_the_hand_does_from_where_it_went_in() -> None:
+    hand = Hand()
+    hand.at(0.001, x=0.3)
+    tip, touches = hand.at(-0.002, x=0.31)
+    assert touches
+    assert tip == pytest.approx([0.01, 0.0, -0.002])
+
+
+@pytest.mark.parametrize("silent_s", [0.0, HOLD_S * 1.01])
+def test_a_hand_that_begins_in_the_tissue_or_was_let_go_in_it_has_to_leave_it_first(silent_s: float) -> None:
+    hand = Hand()
+    if silent_s:
+        hand.at(0.001)
+        assert hand.at(-0.001)[1]
+        assert not hand.at(-0.001, silent_s=silent_s)[1]
+    assert not hand.at(-0.002)[1]
+    assert not hand.at(0.001)[1]
+    assert hand.at(-0.001)[1]
+
+
+def test_a_hand_that_came_in_during_a_silence_has_to_leave_first() -> None:
+    hand = Hand()
+    hand.at(0.001)
+    hand.at(0.001, silent_s=HOLD_S * 2)
+    assert not hand.at(-0.001, silent_s=HOLD_S * 2)[1]
+    assert not hand.at(-0.001)[1]

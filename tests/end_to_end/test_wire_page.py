@@ -1,0 +1,160 @@
+"""The examples in docs/wire.md: bytes and map of each say the same, and both have the form of the code's messages."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+
+from palpate_client import decode_geometry, decode_surface
+from palpate_client.messages import force_of, read_description
+from palpate_client.wire import ACTIONS, Kind
+from palpate_server import wire
+
+PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
+EXAMPLE = re.compile(r"### Example: (.+?)\n\n```json\n(.*?)```\n\n```hex\n(.*?)```", re.DOTALL)
+
+
+def _with_bytes(value: Any) -> Any:
+    if isinstance(value, str) and value.startswith("hex "):
+        return bytes.fromhex(value[4:])
+    if isinstance(value, dict):
+        return {key: _with_bytes(inner) for key, inner in value.items()}
+    return [_with_bytes(inner) for inner in value] if isinstance(value, list) else value
+
+
+EXAMPLES = {
+    title: (_with_bytes(json.loads(text)), bytes.fromhex(data)) for title, text, data in EXAMPLE.findall(PAGE)
+}
+
+
+def test_every_kind_of_message_and_every_action_has_an_example() -> None:
+    assert {message["kind"] for message, _ in EXAMPLES.values()} == set(Kind)
+    for action in ACTIONS:
+        assert [title for title in EXAMPLES if title.startswith("Request") and action in title], action
+        assert [title for title in EXAMPLES if title.startswith("Answer") and action in title], action
+
+
+@pytest.mark.parametrize("title", EXAMPLES)
+def test_the_bytes_of_an_example_are_its_map(title: str) -> None:
+    message, payload = EXAMPLES[title]
+    decoded = msgpack.unpackb(payload)
+    assert decoded == message
+    assert list(decoded) == list(message)
+    assert next(iter(decoded)) == "kind"
+
+
+def test_the_server_reads_the_example_of_a_command() -> None:
+    message, payload = EXAMPLES["Command"]
+    command = wire.decode_command(payload)
+    assert command.sequence == message["sequence"]
+    assert command.position_m == {"tip": tuple(message["position_m"]["tip"])}
+    assert command.velocity_m_per_s == {"tip": tuple(message["velocity_m_per_s"]["tip"])}
+    assert command.rendered_tick == message["rendered_tick"]
+
+
+def test_the_server_encodes_geometry_and_surface_as_in_the_examples() -> None:
+    geometry, payload = EXAMPLES["Geometry"]
+    vertices = np.frombuffer(geometry["vertices_m"], "<f4").reshape(-1, 3).astype(float)
+    triangles = np.frombuffer(geometry["triangles"], "<i4").reshape(-1, 3)
+    assert wire.encode_geometry(vertices, triangles) == payload
+    assert decode_geometry(payload).triangles.tolist() == triangles.ravel().tolist()
+    surface, payload = EXAMPLES["Surface"]
+    displacement = np.frombuffer(surface["displacement_m"], "<f4")
+    assert wire.encode_surface(surface["tick"], surface["server_time_ns"], displacement) == payload
+    assert decode_surface(payload).displacement_m.tolist() == displacement.tolist()
+
+
+def test_the_client_reads_the_examples_of_force_and_describe() -> None:
+    force = force_of(EXAMPLES["Force"][0], 0, 5)
+    assert (force.sequence, force.force_n, force.arrival_ns) == (7, [0.0, 0.25, 0.0], 5)
+    description = read_description(EXAMPLES["Describe"][0])
+    assert description.index("tip") == 0
+    assert description.tools[0].normal == (0.0, -1.0, 0.0)
+
+
+def _shape(value: Any, like: Any) -> None:
+    """Raises AssertionError where maps have other fields, or values other types; a list's items are like its first."""
+    if isinstance(like, dict) and isinstance(value, dict):
+        assert list(value) == list(like)
+        for key in like:
+            _shape(value[key], like[key])
+    elif isinstance(like, list):
+        assert isinstance(value, list)
+        for item in value if like else []:
+            _shape(item, like[0])
+    else:
+        both = {type(value), type(like)}
+        assert len(both - {type(None)}) <= 1 or both == {int, float}, (value, like)
+
+
+def test_a_real_server_answers_in_the_form_of_the_examples(
+    serve: Callable[..., Any], connect: Callable[..., Any], wait_for: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serve("--recordings", str(tmp_path), "--models", str(tmp_path))
+    requests = {
+        "acquire": {},
+        "limits": {},
+        "reset": {},
+        "load": {"file": "model1.npz"},
+        "record": {},
+        "release": {},
+    }
+    with connect(served.endpoint) as client:
+        _shape_but_model(client.query("describe")[1], EXAMPLES["Describe"][0])
+        for action, change in requests.items():
+            (title,) = (t for t in EXAMPLES if t.startswith("Request") and t.endswith(action))
+            granted, answer = client.query(f"control/{client.name}/{action}", EXAMPLES[title][0] | change)
+            assert granted, answer
+            (title,) = (t for t in EXAMPLES if t.startswith("Answer") and t.endswith(action))
+            _shape(answer, EXAMPLES[title][0])
+        granted, answer = client.query(
+            f"control/{client.name}/record", EXAMPLES["Request to end the recording"][0]
+        )
+        assert granted
+        _shape(answer, EXAMPLES["Answer to record"][0])
+        granted, answer = client.query(f"control/{client.name}/reset", EXAMPLES["Request to reset"][0])
+        assert not granted
+        _shape(answer, EXAMPLES["Refusal"][0])
+        _shape(client.next_status(), EXAMPLES["Status"][0])
+        raw: list[bytes] = []
+        subscriber = client.session.declare_subscriber(
+            client.key("force"), lambda sample: raw.append(sample.payload.to_bytes())
+        )
+        wait_for(lambda: raw, "a force")
+        subscriber.undeclare()
+        _shape(msgpack.unpackb(raw[0]), EXAMPLES["Force"][0])
+        assert len(raw[0]) == len(EXAMPLES["Force"][1])
+
+
+def _shape_but_model(described: dict[str, Any], example: dict[str, Any]) -> None:
+    """The example shows some of the devices and of the model's fields only."""
+    assert example["devices"].keys() <= described["devices"].keys()
+    assert example["model"].keys() <= described["model"].keys()
+    some = {
+        "devices": {name: described["devices"][name] for name in example["devices"]},
+        "model": {name: described["model"][name] for name in example["model"]},
+    }
+    _shape(described | some, example)
+
+
+def test_the_program_on_the_page_works_as_it_stands(
+    serve: Callable[..., Any], start: Callable[..., Any], tmp_path: Path
+) -> None:
+    settings, program = (
+        re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)[0] for language in ("json5", "python")
+    )
+    served = serve("--session", "main")
+    config, script = tmp_path / "zenoh.json5", tmp_path / "program.py"
+    config.write_text(settings.replace("tcp/127.0.0.1:7447", served.endpoint))
+    script.write_text(program)
+    code, out, err = start(script, config).finish()
+    assert code == 0, err
+    assert len(out.splitlines()) == 5
+    assert not err
