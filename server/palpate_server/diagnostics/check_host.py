@@ -1,27 +1,39 @@
-"""Is this machine fit to serve forces to a hand? Measures what counts, gives a verdict, and says what to change.
+"""Measures whether this machine can serve forces to a hand: gives a verdict and says what to change.
 
     palpate check-host [--seconds 10] [--json]
 
-Exit code 0: good or marginal. 1: not sufficient. 2: it could not be measured.
+Exit code 0: good or marginal. 1: not sufficient. 2: it could not be measured. 130: Ctrl-C.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import resource
+import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 
+import zenoh
+
 from palpate.model_file import save_model
+from palpate_server import wire
 from palpate_server.arguments import positive
-from palpate_server.diagnostics.round_trips import RoundTrips, ping_pong, through_a_model
+from palpate_server.diagnostics.round_trips import (
+    RoundTrips,
+    free_endpoint,
+    ping_pong,
+    running,
+    through_a_model,
+)
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.realtime import scheduler, shared_memory, threads
 from palpate_server.realtime.native_image import make_image
@@ -30,15 +42,14 @@ from palpate_server.session import status, transport
 
 GOOD, MARGINAL, NOT_SUFFICIENT = "good", "marginal", "not sufficient"
 _TIMER_S = 3.0
+_LOAD_S = 5.0
 _LONGEST_S = 3600.0
 _COMMAND_BYTES, _FORCE_BYTES = 90, 220
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was measured: in words and as values with the unit in their names, the verdict on it, and what to
-    do when it is not good.
-    """
+    """One measurement: as text and as values with their units in the names, its verdict, and what to do if not good."""
 
     name: str
     text: str
@@ -67,6 +78,7 @@ UNANSWERED_SHARE = Bounds(0.01, 0.1)  # of commands: lost, or replaced by a newe
 LATE_SHARE = Bounds(0.001, 0.01)
 SKIPPED_SHARE = Bounds(0.0, 0.001)
 LOAD_PER_CPU = Bounds(0.3, 0.8)
+SILENCE_IN_LEASES = Bounds(0.25, 0.75)  # a link is lost after one
 
 
 def worst(verdicts: Sequence[str]) -> str:
@@ -74,7 +86,7 @@ def worst(verdicts: Sequence[str]) -> str:
 
 
 def settings() -> list[Finding]:
-    """What the kernel and this user's limits allow. None of it alone makes a machine insufficient."""
+    """What the kernel and this user's limits allow. A setting alone never makes a machine insufficient."""
     findings = []
     cpus = len(os.sched_getaffinity(0))
     findings.append(
@@ -144,7 +156,7 @@ def settings() -> list[Finding]:
 
 
 def min_marginal(verdict: str) -> str:
-    """A setting is a hint; the verdict comes from what is measured."""
+    """The verdict of a setting: at worst marginal, since only measurements make a machine insufficient."""
     return MARGINAL if verdict == NOT_SUFFICIENT else verdict
 
 
@@ -216,6 +228,61 @@ def tick_run(seconds: float) -> list[Finding]:
     ]
 
 
+def under_load(seconds: float = _LOAD_S) -> Finding:
+    """Whether a client keeps the link to a server beside busy loops, as many as processors, in sessions of their own.
+
+    The longest silence is that of the forces, as the client receives them; its own wait for a processor is part of it.
+    """
+    arrivals = [time.monotonic()]
+    lost = threading.Event()
+
+    def on_token(sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE:
+            lost.set()
+
+    endpoint, keys = free_endpoint(), wire.Keys("check-host")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "sample.npz"
+        save_model(spring_mass_model(n_modes=50), path)
+        command = ["-m", "palpate_server", str(path), "--listen", endpoint, "--session", keys.session]
+        with (
+            running([sys.executable, *command], "serving"),
+            transport.connect_session(endpoint, None) as session,
+        ):
+            session.liveliness().declare_subscriber(keys.server, on_token, history=True)
+            session.declare_subscriber(keys.force, lambda sample: arrivals.append(time.monotonic()))
+            time.sleep(0.5)
+            arrivals[:] = arrivals[-1:]
+            with busy_loops(len(os.sched_getaffinity(0)), seconds):
+                time.sleep(seconds)
+            arrivals.append(time.monotonic())
+    silence_s = max(later - earlier for earlier, later in pairwise(arrivals))
+    lease_s = transport.LEASE_MS * 1e-3
+    return Finding(
+        "link under load",
+        f"{'lost' if lost.is_set() else 'kept'}, longest silence {silence_s:.3f} s of a lease of {lease_s:g} s",
+        {"lost": lost.is_set(), "longest_silence_s": silence_s, "lease_s": lease_s},
+        NOT_SUFFICIENT if lost.is_set() else SILENCE_IN_LEASES.judge(silence_s / lease_s),
+        "allow real-time priority, so that Zenoh's threads get it too; stop other programs",
+    )
+
+
+@contextlib.contextmanager
+def busy_loops(number: int, longest_s: float) -> Iterator[None]:
+    """Keep processors busy with processes, each in a session of its own. They end after `longest_s` even if we are killed."""
+    loop = f"import time\nend = time.monotonic() + {longest_s}\nwhile time.monotonic() < end: pass"
+    processes = []
+    try:
+        for _ in range(number):
+            processes.append(subprocess.Popen([sys.executable, "-c", loop], start_new_session=True))
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+        for process in processes:
+            process.wait()
+
+
 def _duration(name: str, trips: RoundTrips, advice: str) -> Finding:
     text = f"p50 {trips.p50_s * 1e6:.0f} us, p99 {trips.p99_s * 1e6:.0f} us"
     values = {"p50_s": trips.p50_s, "p99_s": trips.p99_s}
@@ -239,12 +306,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     hints = settings()
     try:
-        measured = [timer(), *transport_round_trip(), *tick_run(options.seconds)]
+        measured = [timer(), *transport_round_trip(), *tick_run(options.seconds), under_load()]
     except transport.TransportError as error:
         print(f"palpate check-host: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        return 2
+        return 130
     verdict = worst([finding.verdict for finding in measured])
     if options.json:
         print(

@@ -1,4 +1,4 @@
-"""What the operating system can do for the loop, when it allows it: scheduling priority, memory that stays."""
+"""What the operating system can do for the loop where it allows it: real-time priority, locked memory."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ import os
 import resource
 import sys
 
-# Of SCHED_FIFO, 1 to 99: above ordinary threads, below the kernel's own. The thread that receives commands runs ticks too;
-# if an ordinary thread could interrupt it in the middle of one, the loop would have to wait for both.
+# Priorities of SCHED_FIFO (1 to 99), above ordinary threads and below the kernel's own. The thread that receives commands
+# runs ticks too: its priority is high, so that no ordinary thread can interrupt a tick that the loop has to wait for.
+# Zenoh's threads keep the links alive and carry the messages; they need little time, but need it within the lease.
 LOOP_PRIORITY = 80
 COMMAND_PRIORITY = 70
-_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # on fault: what is never touched needs no memory
-_SWITCH_INTERVAL_S = 1e-4  # after which a busy Python thread lets another one run
+ZENOH_PRIORITY = 5
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # on fault: only pages that are used take memory
+_SWITCH_INTERVAL_S = 1e-4  # of Python threads
 
 
 def raise_priority(priority: int = LOOP_PRIORITY) -> str | None:
-    """Schedule the calling thread first in, first out; or say why not."""
+    """Give the calling thread a priority of SCHED_FIFO. Threads that it starts inherit it. Returns why not, or None."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError as error:
@@ -29,7 +31,7 @@ def raise_priority(priority: int = LOOP_PRIORITY) -> str | None:
 
 
 def pin(cpu: int) -> str | None:
-    """Keep the calling thread on one processor, by its number; or say why not."""
+    """Keep the calling thread on the processor with this number. Returns why not, or None."""
     try:
         os.sched_setaffinity(0, {cpu})
     except (OSError, OverflowError) as error:
@@ -38,7 +40,7 @@ def pin(cpu: int) -> str | None:
 
 
 def lock_memory() -> str | None:
-    """Keep the process's memory from being swapped out; or say why not."""
+    """Keep the process's memory from being swapped out. Returns why not, or None."""
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if soft != resource.RLIM_INFINITY and os.geteuid() != 0:  # a limited lock makes later allocations fail
         return f"memory is not locked (limit {soft} bytes): allow it with `ulimit -l unlimited`"
@@ -49,7 +51,7 @@ def lock_memory() -> str | None:
 
 
 def calm_interpreter() -> None:
-    """Take what exists out of the garbage collector's sight, and let waiting Python threads run sooner."""
+    """Exclude all existing objects from garbage collection, and shorten the time until a waiting Python thread runs."""
     gc.collect()
     gc.freeze()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)

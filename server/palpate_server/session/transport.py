@@ -1,68 +1,85 @@
-"""Zenoh sessions as this server wants them: loopback, no scouting, unless a configuration file says otherwise."""
+"""Opens Zenoh sessions for the server and its tools: loopback and no scouting, unless a configuration file says otherwise."""
 
 from __future__ import annotations
 
 import json
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
+from palpate_server.realtime import threads
+
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-LEASE_MS = 1000  # after which a peer that does not answer counts as gone
-# The largest message that a server puts together from fragments. Its clients have nothing to say that takes a thousandth
-# of it: it is so large that what they send by mistake arrives, and is counted. What is larger still Zenoh drops before it
-# is collected, and keeps the link; of itself it would collect up to 1 GiB for each client and priority.
+# A peer counts as gone when nothing has come from it for LEASE_MS. It sends KEEP_ALIVES messages in that time at least, so
+# it may wait 3.5 s for a processor: on a busy machine Zenoh's threads of ordinary priority waited for up to 2.3 s.
+LEASE_MS = 4000
+KEEP_ALIVES = 8
+# The largest message that is put together from fragments; the link stays when Zenoh drops a larger one. Clients need less
+# than a thousandth of it: messages that are too large by mistake still arrive, and are counted. Zenoh's own bound is 1 GiB
+# for each client and priority.
 MAX_MESSAGE_BYTES = 2**24
 
-_QUIET: dict[str, Any] = {
-    "mode": "peer",
+_COMMON: dict[str, Any] = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "transport/link/tx/lease": LEASE_MS,
+    "transport/link/tx/keep_alive": KEEP_ALIVES,
+}
+SERVER: dict[str, Any] = {
+    "mode": "peer",
+    "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+    # A client's shared memory would become part of ours, as much of it as the client likes, beyond that bound.
+    "transport/shared_memory/enabled": False,
+    # Forces are sent unbatched: room for 16 of them while the sender's thread is held up, then drop at once.
+    "transport/link/tx/queue/size/real_time": 16,
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+    # Connections that say nothing: up to 400 of them for 2 s each keep no client out.
+    "transport/unicast/accept_pending": 400,
+    "transport/unicast/accept_timeout": 2000,
+}
+CLIENT: dict[str, Any] = {
+    "mode": "client",
+    "listen/endpoints": [],
+    "connect/timeout_ms": 2000,
+    "connect/exit_on_failure": True,
+    # To be back within a second of the server.
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+    "transport/unicast/open_timeout": 2000,
 }
 
 
 class TransportError(Exception):
-    """The session can't be opened; the message says what was asked for and why it failed."""
+    """The session can't be opened. The message names the endpoint or file, and the cause."""
 
 
 def open_session(listen: str | None, config_file: Path | None) -> zenoh.Session:
-    """A session that listens on an endpoint, or one with exactly the configuration in a file.
+    """A server's session: listens on an endpoint, or has exactly the configuration in a file.
+
+    Zenoh's own threads get a low real-time priority where that is allowed: they inherit it from the thread that opens the
+    first session of a process. Threads that call back into Python inherit from the thread that declares, so Python's
+    work stays at ordinary priority.
 
     Raises TransportError when the file can't be read, or the endpoint is malformed or in use.
     """
     endpoint = listen or DEFAULT_ENDPOINT
-    settings = {
-        "listen/endpoints": [endpoint],
-        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
-        # A client's shared memory would become part of ours, past that bound: as much of it as the client likes.
-        "transport/shared_memory/enabled": False,
-        # Forces are sent unbatched: room for 16 of them while the sender's thread is held up, then drop at once.
-        "transport/link/tx/queue/size/real_time": 16,
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
-    }
-    return _open(settings, endpoint, config_file)
+    settings = SERVER | {"listen/endpoints": [endpoint]}
+    with ThreadPoolExecutor(1, "open", threads.raise_priority, (threads.ZENOH_PRIORITY,)) as opener:
+        return opener.submit(_open, settings, endpoint, config_file).result()
 
 
 def connect_session(endpoint: str, config_file: Path | None) -> zenoh.Session:
-    """A session that connects to an endpoint, or one with exactly the configuration in a file. Raises TransportError."""
-    settings = {
-        "mode": "client",
-        "listen/endpoints": [],
-        "connect/endpoints": [endpoint],
-        "connect/timeout_ms": 2000,
-        "connect/exit_on_failure": True,
-    }
-    return _open(settings, endpoint, config_file)
+    """A client's session: connects to an endpoint, or has exactly the configuration in a file. Raises TransportError."""
+    return _open(CLIENT | {"connect/endpoints": [endpoint]}, endpoint, config_file)
 
 
 def _open(settings: dict[str, Any], endpoint: str, config_file: Path | None) -> zenoh.Session:
     try:
         if config_file is None:
             config = zenoh.Config()
-            for key, value in (_QUIET | settings).items():
+            for key, value in (_COMMON | settings).items():
                 config.insert_json5(key, json.dumps(value))
         elif config_file.is_file():
             config = zenoh.Config.from_file(config_file)
@@ -75,13 +92,13 @@ def _open(settings: dict[str, Any], endpoint: str, config_file: Path | None) -> 
 
 
 def _first_cause(error: zenoh.ZError) -> str:
-    """Zenoh's own words on one line: without the places in its source, or the drawing around a syntax error."""
+    """Zenoh's message on one line, without places in its source and without the picture of a syntax error."""
     text = str(error)
     syntax = re.search(r"--> (\d+):(\d+).*= (expected .*)", text, re.DOTALL)
     if syntax:
         line, column, expected = syntax.groups()
         return f"line {line}, column {column}: {' '.join(expected.split())}"
     text = text.removeprefix('Json5Err(Message { msg: "').split(" at /", 1)[0].replace('\\"', '"')
-    if text.count("[") > text.count("]"):  # its end stood behind the place
+    if text.count("[") > text.count("]"):  # the closing one was cut off with the place
         text = "".join(text.rsplit("[", 1))
     return " ".join(text.split()).rstrip(".") or "refused"

@@ -1,14 +1,20 @@
-"""The host check: how verdicts are made, and that it ends with one on this machine, whatever it is."""
+"""The host check: its verdicts, its exit codes, and what it measures on this machine."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import subprocess
 import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from palpate_server.diagnostics import check_host
-from palpate_server.diagnostics.check_host import GOOD, MARGINAL, NOT_SUFFICIENT, Bounds
+from palpate_server.diagnostics import check_host, round_trips
+from palpate_server.diagnostics.check_host import GOOD, MARGINAL, NOT_SUFFICIENT, Bounds, Finding
 from palpate_server.diagnostics.round_trips import RoundTrips
 
 
@@ -50,8 +56,7 @@ def test_messages_that_get_no_answer_count_however_fast_the_others_are(
 def test_a_check_ends_with_a_verdict_and_says_what_it_measured(capsys: pytest.CaptureFixture[str]) -> None:
     code = check_host.main(["--seconds", "1", "--json"])
     report = json.loads(capsys.readouterr().out)
-    assert code == (1 if report["verdict"] == NOT_SUFFICIENT else 0)
-    names = {finding["name"] for finding in report["findings"]}
+    findings = {finding["name"]: finding for finding in report["findings"]}
     measured = {
         "timer lateness": {"p50_s", "p99_s"},
         "Zenoh round trip": {"p50_s", "p99_s"},
@@ -60,13 +65,66 @@ def test_a_check_ends_with_a_verdict_and_says_what_it_measured(capsys: pytest.Ca
         "unanswered commands": {"share"},
         "late ticks": {"share"},
         "skipped ticks": {"share"},
+        "link under load": {"lost", "longest_silence_s", "lease_s"},
     }
-    assert measured.keys() <= names
-    for finding in report["findings"]:
-        assert finding["text"]
-        if finding["name"] in measured:
-            assert finding["values"].keys() == measured[finding["name"]]
-            assert all(type(value) is float for value in finding["values"].values())
+    verdicts = [findings[name]["verdict"] for name in measured]
+    assert report["verdict"] == max(verdicts, key=[GOOD, MARGINAL, NOT_SUFFICIENT].index)
+    assert code == (NOT_SUFFICIENT in verdicts)
+    for name, keys in measured.items():
+        values = findings[name]["values"]
+        assert values.keys() == keys
+        assert all(isinstance(value, float | bool) for value in values.values())
+        # Each is a time of this machine, or a share: neither 0 nor more than the check itself took.
+        assert all(0 < value < 60 for key, value in values.items() if key.endswith("_s"))
+        assert 0 <= values.get("share", 0) <= 1
+
+
+@pytest.mark.parametrize(
+    ("worst_share", "code"), [(0.0, 0), (check_host.UNANSWERED_SHARE.marginal, 0), (0.5, 1)]
+)
+def test_the_exit_code_says_whether_the_machine_is_sufficient(
+    worst_share: float, code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finding = Finding("share", "", {}, check_host.UNANSWERED_SHARE.judge(worst_share))
+    monkeypatch.setattr(check_host, "timer", lambda: finding)
+    monkeypatch.setattr(check_host, "transport_round_trip", lambda: [finding])
+    monkeypatch.setattr(check_host, "tick_run", lambda seconds: [finding])
+    monkeypatch.setattr(check_host, "under_load", lambda: finding)
+    assert check_host.main([]) == code
+
+
+def test_a_link_that_is_lost_under_load_is_not_sufficient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that ends in the middle of the load takes its token with it."""
+    servers: list[subprocess.Popen[str]] = []
+
+    class Watched(subprocess.Popen):  # type: ignore[type-arg]
+        def __init__(self, command: list[str], **options: Any) -> None:
+            super().__init__(command, **options)
+            servers.append(self)
+
+    @contextlib.contextmanager
+    def loops_that_end_the_server(number: int, longest_s: float) -> Iterator[None]:
+        servers[0].kill()
+        yield
+
+    monkeypatch.setattr(round_trips.subprocess, "Popen", Watched)
+    monkeypatch.setattr(check_host, "busy_loops", loops_that_end_the_server)
+    finding = check_host.under_load(1.0)
+    assert finding.values["lost"] is True
+    assert finding.verdict == NOT_SUFFICIENT
+
+
+def test_busy_loops_run_in_sessions_of_their_own_and_end_with_the_block() -> None:
+    def children() -> set[int]:
+        return {int(pid) for pid in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()}
+
+    before = children()
+    with check_host.busy_loops(2, 60.0):
+        loops = children() - before
+        sessions = {os.getsid(pid) for pid in loops}
+    assert len(loops) == 2
+    assert sessions == loops
+    assert not children() & loops
 
 
 def test_ctrl_c_ends_a_check_and_the_threads_it_has_started(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,5 +133,5 @@ def test_ctrl_c_ends_a_check_and_the_threads_it_has_started(monkeypatch: pytest.
 
     before = threading.active_count()
     monkeypatch.setattr(check_host.time, "sleep", interrupted)
-    assert check_host.main([]) == 2
+    assert check_host.main([]) == 130
     assert threading.active_count() == before

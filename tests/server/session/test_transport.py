@@ -1,18 +1,29 @@
-"""The server's Zenoh session: what it lets a client send."""
+"""The server's Zenoh session: what it lets a client send, who can connect, the priority of its threads."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 import zenoh
 
 from palpate_server.diagnostics.round_trips import free_endpoint
+from palpate_server.realtime import threads
 from palpate_server.session import transport
 
 CHANNEL_CAPACITY = 100
+SHIPPED = Path(__file__).parents[3] / "configs" / "security"
+with ThreadPoolExecutor(1) as executor:
+    RUNS_REAL_TIME_THREADS = executor.submit(threads.raise_priority).result() is None
 
 
 @pytest.fixture
@@ -26,7 +37,7 @@ def server(endpoint: str) -> Iterator[zenoh.Session]:
         yield session
 
 
-def test_a_message_beyond_all_mistakes_is_dropped_and_the_link_stays(
+def test_a_message_above_the_bound_is_dropped_and_the_link_stays(
     server: zenoh.Session, endpoint: str
 ) -> None:
     with transport.connect_session(endpoint, None) as client:
@@ -69,8 +80,85 @@ def test_an_endpoint_in_use_is_refused_without_loose_brackets(server: zenoh.Sess
     assert str(caught.value).count("[") == str(caught.value).count("]")
 
 
-def test_the_shipped_configuration_has_the_same_bound() -> None:
-    shipped = Path(__file__).parents[3] / "configs" / "security" / "server.json5"
-    config = zenoh.Config.from_file(shipped)
-    assert json.loads(config.get_json("transport/link/rx/max_message_size")) == transport.MAX_MESSAGE_BYTES
-    assert json.loads(config.get_json("transport/shared_memory/enabled")) is False
+# Zenoh starts its threads once in a process: each priority is looked at in a process of its own.
+PRIORITIES = """
+import json, os
+from pathlib import Path
+from palpate_server.session import transport
+
+def priorities():
+    found = {}
+    for task in Path("/proc/self/task").iterdir():
+        try:
+            found[task.name] = ((task / "comm").read_text()[:4], os.sched_getparam(int(task.name)).sched_priority)
+        except (FileNotFoundError, ProcessLookupError):  # a thread that has just ended
+            pass
+    return found
+
+with transport.open_session("tcp/127.0.0.1:0", None) as session:
+    before = priorities()
+    session.declare_subscriber("key", print)
+    after = priorities()
+    zenoh = [priority for name, priority in before.values() if name in ("app-", "net-", "acc-")]
+    callback = [priority for task, (name, priority) in after.items() if task not in before]
+    print(json.dumps({"zenoh": zenoh, "callback": callback}))
+"""
+
+
+def _priorities(*prefix: str) -> dict[str, list[int]]:
+    program = subprocess.run(
+        [*prefix, sys.executable, "-c", PRIORITIES], capture_output=True, text=True, timeout=60, check=True
+    )
+    found: dict[str, list[int]] = json.loads(program.stdout)
+    assert len(found["zenoh"]) == 3
+    assert len(found["callback"]) == 1
+    return found
+
+
+@pytest.mark.skipif(not RUNS_REAL_TIME_THREADS, reason="this user may not have threads of real-time priority")
+def test_zenoh_s_threads_have_a_low_real_time_priority_and_those_that_call_python_none() -> None:
+    found = _priorities()
+    assert set(found["zenoh"]) == {threads.ZENOH_PRIORITY}
+    assert found["callback"] == [0]
+    assert 0 < threads.ZENOH_PRIORITY < threads.COMMAND_PRIORITY < threads.LOOP_PRIORITY
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("setpriv") is None, reason="needs root and setpriv")
+def test_a_session_opens_where_no_real_time_priority_is_allowed() -> None:
+    found = _priorities(
+        "prlimit", "--rtprio=0", "setpriv", "--bounding-set=-sys_nice", "--inh-caps=-sys_nice"
+    )
+    assert set(found["zenoh"]) == {0}
+
+
+def test_connections_that_say_nothing_keep_no_client_out(server: zenoh.Session, endpoint: str) -> None:
+    host, port = endpoint.removeprefix("tcp/").split(":")
+    with contextlib.ExitStack() as idle:
+        for _ in range(300):
+            idle.enter_context(socket.create_connection((host, int(port))))
+        with transport.connect_session(endpoint, None) as client:
+            assert list(client.info.peers_zid()) == [server.zid()]
+
+
+@pytest.mark.parametrize("name", ["server", "client", "router"])
+def test_the_shipped_configurations_have_the_same_lease(name: str) -> None:
+    config = zenoh.Config.from_file(SHIPPED / f"{name}.json5")
+    assert json.loads(config.get_json("transport/link/tx/lease")) == transport.LEASE_MS
+    assert json.loads(config.get_json("transport/link/tx/keep_alive")) == transport.KEEP_ALIVES
+
+
+def test_the_shipped_configuration_of_a_server_has_the_same_bounds() -> None:
+    config = zenoh.Config.from_file(SHIPPED / "server.json5")
+    for key in (
+        "transport/link/rx/max_message_size",
+        "transport/shared_memory/enabled",
+        "transport/unicast/accept_pending",
+        "transport/unicast/accept_timeout",
+    ):
+        assert json.loads(config.get_json(key)) == transport.SERVER[key]
+
+
+def test_the_shipped_configuration_of_a_client_comes_back_as_soon() -> None:
+    config = zenoh.Config.from_file(SHIPPED / "client.json5")
+    for key in ("connect/retry", "transport/unicast/open_timeout"):
+        assert json.loads(config.get_json(key)) == transport.CLIENT[key]

@@ -1,0 +1,100 @@
+"""A machine whose processors are all taken by other programs: clients keep their link to the server."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from palpate.model_file import save_model
+from palpate_server import wire
+from palpate_server.diagnostics.round_trips import free_endpoint
+from palpate_server.diagnostics.sample_model import spring_mass_model
+from palpate_server.session import transport
+
+CLIENTS, LOOPS, RUNS = 3, 4, 10
+KEYS = wire.Keys("test")
+# The kernel shares processors between sessions first: the server in one, everything else in another, is the hard case.
+IN_A_SESSION_OF_ITS_OWN = (
+    "import os, sys; os.setsid(); os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+)
+# What a client of the wire is to Zenoh, in a process of its own. Prints a line for each sign of the server's token.
+CLIENT = """
+import sys, threading, zenoh
+from palpate_server.session import transport
+with transport.connect_session(sys.argv[1], None) as session:
+    subscribers = [
+        session.liveliness().declare_subscriber(
+            sys.argv[2],
+            lambda sample: print("PUT" if sample.kind == zenoh.SampleKind.PUT else "DELETE", flush=True),
+            history=True,
+        ),
+        session.declare_subscriber(sys.argv[3], lambda sample: None),
+    ]
+    threading.Event().wait()
+"""
+
+
+@contextmanager
+def _busy_loops() -> Iterator[None]:
+    """In the session of the clients. They end by themselves should the test be killed."""
+    loop = "import time\nend = time.monotonic() + 120\nwhile time.monotonic() < end: pass"
+    processes: list[subprocess.Popen[bytes]] = []
+    try:
+        for _ in range(LOOPS):
+            processes.append(subprocess.Popen([sys.executable, "-c", loop]))
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+        for process in processes:
+            process.wait()
+
+
+def _keeps_its_clients(start: Callable[..., Any], folder: Path, seconds: float) -> None:
+    """A server's clients see its token once, and it stays for this long beside busy loops, counted by the forces."""
+    model = spring_mass_model(1, 20)
+    save_model(model, folder / "model.npz")
+    endpoint = free_endpoint()
+    server = start(
+        *("-c", IN_A_SESSION_OF_ITS_OWN, "-m", "palpate_server", folder / "model.npz"),
+        *("--listen", endpoint, "--session", KEYS.session),
+        ready="serving",
+    )
+    clients = [start("-c", CLIENT, endpoint, KEYS.server, KEYS.force, ready="PUT") for _ in range(CLIENTS)]
+    forces = 0
+    enough = threading.Event()
+
+    def count(sample: zenoh.Sample) -> None:
+        nonlocal forces
+        forces += 1
+        if forces * model.period_s > seconds:
+            enough.set()
+
+    with _busy_loops(), transport.connect_session(endpoint, None) as session:
+        session.declare_subscriber(KEYS.force, count)
+        assert enough.wait(4 * seconds), f"{forces} forces came"
+    for client in clients:
+        assert client.process.poll() is None, client.printed()
+        assert client.printed().split() == ["PUT"]
+        client.process.kill()
+    assert server.stop() == 0
+
+
+def test_no_client_loses_the_server_beside_busy_loops(start: Callable[..., Any], tmp_path: Path) -> None:
+    _keeps_its_clients(start, tmp_path, 8.0)
+
+
+@pytest.mark.slow
+def test_no_client_loses_the_server_in_ten_runs_beside_busy_loops(
+    start: Callable[..., Any], tmp_path: Path
+) -> None:
+    for _ in range(RUNS):
+        _keeps_its_clients(start, tmp_path, 12.0)
