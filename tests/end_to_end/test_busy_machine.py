@@ -14,13 +14,13 @@ import pytest
 import zenoh
 
 from palpate.model_file import save_model
-from palpate_server import wire
+from palpate_client.wire import Keys
 from palpate_server.diagnostics.round_trips import free_endpoint
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.session import transport
 
 CLIENTS, LOOPS, RUNS = 3, 4, 10
-KEYS = wire.Keys("test")
+KEYS = Keys("test")
 # The kernel shares processors between sessions first: the server in one, everything else in another, is the hard case.
 IN_A_SESSION_OF_ITS_OWN = (
     "import os, sys; os.setsid(); os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"

@@ -25,7 +25,7 @@ from pathlib import Path
 import zenoh
 
 from palpate.model_file import save_model
-from palpate_server import wire
+from palpate_client.wire import LEASE_MS, Keys
 from palpate_server.arguments import positive
 from palpate_server.diagnostics.round_trips import (
     RoundTrips,
@@ -240,7 +240,7 @@ def under_load(seconds: float = _LOAD_S) -> Finding:
         if sample.kind == zenoh.SampleKind.DELETE:
             lost.set()
 
-    endpoint, keys = free_endpoint(), wire.Keys("check-host")
+    endpoint, keys = free_endpoint(), Keys("check-host")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "sample.npz"
         save_model(spring_mass_model(n_modes=50), path)
@@ -257,7 +257,7 @@ def under_load(seconds: float = _LOAD_S) -> Finding:
                 time.sleep(seconds)
             arrivals.append(time.monotonic())
     silence_s = max(later - earlier for earlier, later in pairwise(arrivals))
-    lease_s = transport.LEASE_MS * 1e-3
+    lease_s = LEASE_MS * 1e-3
     return Finding(
         "link under load",
         f"{'lost' if lost.is_set() else 'kept'}, longest silence {silence_s:.3f} s of a lease of {lease_s:g} s",

@@ -4,32 +4,27 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
+from palpate_client import connection
+from palpate_client.errors import ClientError
+from palpate_client.wire import DEFAULT_ENDPOINT as DEFAULT_ENDPOINT
+from palpate_client.wire import KEEP_ALIVES, LEASE_MS, MAX_MESSAGE_BYTES
 from palpate_server.realtime import threads
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-# A peer counts as gone when nothing has come from it for LEASE_MS. It sends KEEP_ALIVES messages in that time at least, so
-# it may wait 3.5 s for a processor: on a busy machine Zenoh's threads of ordinary priority waited for up to 2.3 s.
-LEASE_MS = 4000
-KEEP_ALIVES = 8
-# The largest message that is put together from fragments; the link stays when Zenoh drops a larger one. Clients need less
-# than a thousandth of it: messages that are too large by mistake still arrive, and are counted. Zenoh's own bound is 1 GiB
-# for each client and priority.
-MAX_MESSAGE_BYTES = 2**24
-
-_COMMON: dict[str, Any] = {
+SETTINGS: Mapping[str, Any] = {
+    "mode": "peer",
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "transport/link/tx/lease": LEASE_MS,
     "transport/link/tx/keep_alive": KEEP_ALIVES,
-}
-SERVER: dict[str, Any] = {
-    "mode": "peer",
+    # Of a message that comes in fragments. Clients need less than a thousandth of it: a message that is too large by mistake
+    # still arrives, and is counted. Zenoh drops larger ones and keeps the link; its own bound is 1 GiB a client and priority.
     "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
     # A client's shared memory would become part of ours, as much of it as the client likes, beyond that bound.
     "transport/shared_memory/enabled": False,
@@ -39,15 +34,6 @@ SERVER: dict[str, Any] = {
     # Connections that say nothing: up to 400 of them for 2 s each keep no client out.
     "transport/unicast/accept_pending": 400,
     "transport/unicast/accept_timeout": 2000,
-}
-CLIENT: dict[str, Any] = {
-    "mode": "client",
-    "listen/endpoints": [],
-    "connect/timeout_ms": 2000,
-    "connect/exit_on_failure": True,
-    # To be back within a second of the server.
-    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
-    "transport/unicast/open_timeout": 2000,
 }
 
 
@@ -65,21 +51,15 @@ def open_session(listen: str | None, config_file: Path | None) -> zenoh.Session:
     Raises TransportError when the file can't be read, or the endpoint is malformed or in use.
     """
     endpoint = listen or DEFAULT_ENDPOINT
-    settings = SERVER | {"listen/endpoints": [endpoint]}
     with ThreadPoolExecutor(1, "open", threads.raise_priority, (threads.ZENOH_PRIORITY,)) as opener:
-        return opener.submit(_open, settings, endpoint, config_file).result()
+        return opener.submit(_open, endpoint, config_file).result()
 
 
-def connect_session(endpoint: str, config_file: Path | None) -> zenoh.Session:
-    """A client's session: connects to an endpoint, or has exactly the configuration in a file. Raises TransportError."""
-    return _open(CLIENT | {"connect/endpoints": [endpoint]}, endpoint, config_file)
-
-
-def _open(settings: dict[str, Any], endpoint: str, config_file: Path | None) -> zenoh.Session:
+def _open(endpoint: str, config_file: Path | None) -> zenoh.Session:
     try:
         if config_file is None:
             config = zenoh.Config()
-            for key, value in (_COMMON | settings).items():
+            for key, value in {**SETTINGS, "listen/endpoints": [endpoint]}.items():
                 config.insert_json5(key, json.dumps(value))
         elif config_file.is_file():
             config = zenoh.Config.from_file(config_file)
@@ -89,6 +69,14 @@ def _open(settings: dict[str, Any], endpoint: str, config_file: Path | None) -> 
     except zenoh.ZError as error:
         origin = f"zenoh configuration {config_file}" if config_file else f"endpoint {endpoint}"
         raise TransportError(f"{origin}: {_first_cause(error)}") from error
+
+
+def connect_session(endpoint: str, config_file: Path | None) -> zenoh.Session:
+    """A client's session, as palpate_client opens it. Raises TransportError."""
+    try:
+        return connection.open_session(endpoint, config_file)
+    except ClientError as error:
+        raise TransportError(str(error)) from error
 
 
 def _first_cause(error: zenoh.ZError) -> str:
