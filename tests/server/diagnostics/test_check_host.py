@@ -5,17 +5,18 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
+import zenoh
 
-from palpate_server.diagnostics import check_host, round_trips
+from palpate_client.wire import Keys
+from palpate_server.diagnostics import check_host
 from palpate_server.diagnostics.check_host import GOOD, MARGINAL, NOT_SUFFICIENT, Bounds, Finding
 from palpate_server.diagnostics.round_trips import RoundTrips
+from palpate_server.session import transport
 
 
 def test_a_value_is_judged_by_its_bounds() -> None:
@@ -94,21 +95,23 @@ def test_the_exit_code_says_whether_the_machine_is_sufficient(
 
 
 def test_a_link_that_is_lost_under_load_is_not_sufficient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A server that ends in the middle of the load takes its token with it."""
-    servers: list[subprocess.Popen[str]] = []
-
-    class Watched(subprocess.Popen):  # type: ignore[type-arg]
-        def __init__(self, command: list[str], **options: Any) -> None:
-            super().__init__(command, **options)
-            servers.append(self)
+    servers: list[zenoh.Session] = []
 
     @contextlib.contextmanager
-    def loops_that_end_the_server(number: int, longest_s: float) -> Iterator[None]:
-        servers[0].kill()
+    def a_token_without_a_server(command: list[str], ready: str) -> Iterator[None]:
+        with transport.open_session(command[command.index("--listen") + 1], None) as session:
+            token = session.liveliness().declare_token(Keys("check-host").server)
+            servers.append(session)
+            yield
+            del token
+
+    @contextlib.contextmanager
+    def load_that_ends_the_server(number: int, longest_s: float) -> Iterator[None]:
+        servers[0].close()  # type: ignore[no-untyped-call]
         yield
 
-    monkeypatch.setattr(round_trips.subprocess, "Popen", Watched)
-    monkeypatch.setattr(check_host, "busy_loops", loops_that_end_the_server)
+    monkeypatch.setattr(check_host, "running", a_token_without_a_server)
+    monkeypatch.setattr(check_host, "busy_loops", load_that_ends_the_server)
     finding = check_host.under_load(1.0)
     assert finding.values["lost"] is True
     assert finding.verdict == NOT_SUFFICIENT
