@@ -14,10 +14,10 @@ import pytest
 import zenoh
 
 from palpate.model_file import save_model
+from palpate_client.connection import open_session
+from palpate_client.local_server import free_endpoint
 from palpate_client.wire import Keys
-from palpate_server.diagnostics.round_trips import free_endpoint
 from palpate_server.diagnostics.sample_model import spring_mass_model
-from palpate_server.session import transport
 
 CLIENTS, LOOPS, RUNS = 3, 4, 10
 KEYS = Keys("test")
@@ -28,8 +28,8 @@ IN_A_SESSION_OF_ITS_OWN = (
 # What a client of the wire is to Zenoh, in a process of its own. Prints a line for each sign of the server's token.
 CLIENT = """
 import sys, threading, zenoh
-from palpate_server.session import transport
-with transport.connect_session(sys.argv[1], None) as session:
+from palpate_client.connection import open_session
+with open_session(sys.argv[1]) as session:
     subscribers = [
         session.liveliness().declare_subscriber(
             sys.argv[2],
@@ -78,7 +78,7 @@ def _keeps_its_clients(start: Callable[..., Any], folder: Path, seconds: float) 
         if forces * model.period_s > seconds:
             enough.set()
 
-    with _busy_loops(), transport.connect_session(endpoint, None) as session:
+    with _busy_loops(), open_session(endpoint) as session:
         session.declare_subscriber(KEYS.force, count)
         assert enough.wait(4 * seconds), f"{forces} forces came"
     for client in clients:

@@ -25,20 +25,17 @@ from pathlib import Path
 import zenoh
 
 from palpate.model_file import save_model
+from palpate_client.connection import open_session
+from palpate_client.errors import ClientError
+from palpate_client.local_server import free_endpoint, running
 from palpate_client.wire import LEASE_MS, Keys
 from palpate_server.arguments import positive
-from palpate_server.diagnostics.round_trips import (
-    RoundTrips,
-    free_endpoint,
-    ping_pong,
-    running,
-    through_a_model,
-)
+from palpate_server.diagnostics.round_trips import RoundTrips, ping_pong, through_a_model
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.realtime import scheduler, shared_memory, threads
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import Limits
-from palpate_server.session import status, transport
+from palpate_server.session import status
 
 GOOD, MARGINAL, NOT_SUFFICIENT = "good", "marginal", "not sufficient"
 _TIMER_S = 3.0
@@ -247,7 +244,7 @@ def under_load(seconds: float = _LOAD_S) -> Finding:
         command = ["-m", "palpate_server", str(path), "--listen", endpoint, "--session", keys.session]
         with (
             running([sys.executable, *command], "serving"),
-            transport.connect_session(endpoint, None) as session,
+            open_session(endpoint) as session,
         ):
             session.liveliness().declare_subscriber(keys.server, on_token, history=True)
             session.declare_subscriber(keys.force, lambda sample: arrivals.append(time.monotonic()))
@@ -307,7 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     hints = settings()
     try:
         measured = [timer(), *transport_round_trip(), *tick_run(options.seconds), under_load()]
-    except transport.TransportError as error:
+    except ClientError as error:
         print(f"palpate check-host: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

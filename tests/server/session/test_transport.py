@@ -16,8 +16,9 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from palpate_client.connection import open_session
+from palpate_client.local_server import free_endpoint
 from palpate_client.wire import KEEP_ALIVES, LEASE_MS, MAX_MESSAGE_BYTES
-from palpate_server.diagnostics.round_trips import free_endpoint
 from palpate_server.realtime import threads
 from palpate_server.session import transport
 
@@ -41,7 +42,7 @@ def server(endpoint: str) -> Iterator[zenoh.Session]:
 def test_a_message_above_the_bound_is_dropped_and_the_link_stays(
     server: zenoh.Session, endpoint: str
 ) -> None:
-    with transport.connect_session(endpoint, None) as client:
+    with open_session(endpoint) as client:
         heard = server.declare_subscriber("sizes", zenoh.handlers.FifoChannel(CHANNEL_CAPACITY))
         sizes = [16384, 2 * MAX_MESSAGE_BYTES, 10_000_000, 4096, 0]
         for size in sizes:
@@ -57,7 +58,7 @@ def test_a_client_hears_a_geometry_of_a_hundred_thousand_vertices(
 ) -> None:
     geometry = bytes(12 * 100_000 + 12 * 200_000)  # float32 positions, int32 triangles: twice as many
     answering = server.declare_queryable("geometry", lambda query: query.reply("geometry", geometry))
-    with transport.connect_session(endpoint, None) as client:
+    with open_session(endpoint) as client:
         (reply,) = client.get("geometry", timeout=10.0)
         assert reply.ok is not None
         assert len(reply.ok.payload) == len(geometry)
@@ -137,7 +138,7 @@ def test_connections_that_say_nothing_keep_no_client_out(server: zenoh.Session, 
     with contextlib.ExitStack() as idle:
         for _ in range(300):
             idle.enter_context(socket.create_connection((host, int(port))))
-        with transport.connect_session(endpoint, None) as client:
+        with open_session(endpoint) as client:
             assert list(client.info.peers_zid()) == [server.zid()]
 
 
