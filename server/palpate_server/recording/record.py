@@ -24,10 +24,10 @@ from pathlib import Path
 
 import zenoh
 
-from palpate_client import wire
-from palpate_server.arguments import need, positive
+from palpate_client import ClientError, wire
+from palpate_client.arguments import add_connection_options, connection_for, positive
+from palpate_server.arguments import need
 from palpate_server.realtime.safety import Flags
-from palpate_server.session import transport
 from palpate_server.wire import MAX_RECORDED_BYTES
 
 if __name__ == "__main__":
@@ -35,7 +35,6 @@ if __name__ == "__main__":
 
 from palpate_server.recording.mcap_file import Recording
 
-_QUERY_TIMEOUT_S = 3.0
 _MANY_FORCES = 1000  # a second of them
 
 
@@ -93,8 +92,11 @@ def record(
 
     def write(item: tuple[str, str, int, bytes]) -> None:
         kind, *_, payload = item
-        if len(payload) <= MAX_RECORDED_BYTES:
-            recording.add(*item)
+        try:
+            wire.unpack(payload, wire.Kind(kind), MAX_RECORDED_BYTES)
+        except wire.MalformedMessage:
+            return  # of another kind than its key's, or nothing that a replay could use
+        recording.add(*item)
         if hearing.misses_commands(kind, payload):
             on_no_commands()
 
@@ -110,34 +112,18 @@ def record(
         write(heard.get())
 
 
-def _describe(session: zenoh.Session, keys: wire.Keys) -> bytes:
-    """The describe reply. Raises TransportError without a server."""
-    give_up = time.monotonic() + _QUERY_TIMEOUT_S
-    while time.monotonic() < give_up:  # right after connecting, its queryables may not be known here yet
-        for reply in session.get(keys.describe, timeout=_QUERY_TIMEOUT_S):
-            if reply.ok is not None:
-                return reply.ok.payload.to_bytes()
-        time.sleep(0.05)
-    raise transport.TransportError(f"no server answers for {keys.describe}")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="palpate record", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, metavar="OUT.mcap", help="a new file")
-    parser.add_argument(
-        "--connect", default=transport.DEFAULT_ENDPOINT, metavar="ENDPOINT", help="(%(default)s)"
-    )
-    parser.add_argument("--session", default="main", help="(%(default)s)")
-    parser.add_argument("--zenoh-config", type=Path, metavar="FILE", help="used instead of --connect")
+    add_connection_options(parser, name=False)
     parser.add_argument("--duration-s", type=positive, metavar="S", help="(default: until Ctrl-C)")
     options = parser.parse_args(arguments)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     try:
-        keys = wire.Keys(options.session)
-        with transport.connect_session(options.connect, options.zenoh_config) as session:
-            description = _describe(session, keys)
+        with connection_for(options) as connection:
+            keys = connection.keys
             try:
                 stream = options.out.open("xb")
             except FileExistsError:
@@ -149,10 +135,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 recording = Recording(stream)
                 print(f"recording {keys.prefix} to {options.out}; Ctrl-C ends it", flush=True)
                 record(
-                    session,
+                    connection.zenoh,
                     keys,
                     recording,
-                    description,
+                    wire.pack(connection.description.message),
                     lambda: stop.is_set() or time.monotonic() >= end_s,
                     _say_that_no_commands_are_heard,
                 )
@@ -163,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 with contextlib.suppress(OSError):  # what could not be written can't be written now
                     stream.close()
                 return 1
-    except (OSError, ValueError, transport.TransportError) as error:
+    except (OSError, ValueError, ClientError) as error:
         print(f"palpate record: {error}", file=sys.stderr)
         return 2
     print(f"{recording.messages} messages in {options.out}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import threading
@@ -9,8 +10,9 @@ import time
 
 import msgpack
 
-from palpate_server import wire
-from palpate_server.diagnostics.round_trips import free_endpoint
+from palpate_client import wire
+from palpate_client.connection import open_session
+from palpate_client.local_server import free_endpoint
 from palpate_server.realtime.safety import Flags
 from palpate_server.recording.mcap_file import Recording
 from palpate_server.recording.record import Hearing, record
@@ -18,7 +20,7 @@ from palpate_server.session import transport
 
 
 def force(sequence: int, flags: int = 0) -> bytes:
-    return msgpack.packb({"sequence": [-1, sequence], "flags": [int(Flags.STALE), flags]})
+    return msgpack.packb({"kind": "force", "sequence": [-1, sequence], "flags": [int(Flags.STALE), flags]})
 
 
 def notices(*messages: tuple[str, bytes]) -> int:
@@ -44,7 +46,7 @@ def test_a_recording_without_the_commands_that_were_answered_is_told_of_while_it
     give_up = time.monotonic() + 20
     with (
         transport.open_session(endpoint, None) as server,
-        transport.connect_session(endpoint, None) as client,
+        contextlib.closing(open_session(endpoint)) as client,
     ):
         stop = threading.Event()
 
