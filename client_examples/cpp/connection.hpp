@@ -120,7 +120,8 @@ class Connection {
     Acquired acquire(const Tool& tool, const std::optional<DeviceTerms>& device) {
         tool_ = tool.name;
         msgpack::sbuffer request;
-        auto packer = begin_request(request, device ? 5 : 2);
+        msgpack::packer<msgpack::sbuffer> packer(request);
+        begin_request(packer, device ? 5 : 2);
         packer.pack("tools").pack(std::vector<std::string>{tool.name});
         packer.pack("frame").pack_map(1).pack("model_origin_m").pack(tool.start_m);
         if (device) {
@@ -139,7 +140,8 @@ class Connection {
 
     void release() {
         msgpack::sbuffer request;
-        begin_request(request, 0);
+        msgpack::packer<msgpack::sbuffer> packer(request);
+        begin_request(packer, 0);
         query("control/" + client_ + "/release", &request);
     }
 
@@ -164,12 +166,10 @@ class Connection {
     static constexpr int schema_version = 2;
 
     // What every request begins with; then its own fields follow.
-    static msgpack::packer<msgpack::sbuffer> begin_request(msgpack::sbuffer& request, std::uint32_t fields) {
-        msgpack::packer<msgpack::sbuffer> packer(request);
+    static void begin_request(msgpack::packer<msgpack::sbuffer>& packer, std::uint32_t fields) {
         packer.pack_map(fields + 2);
         packer.pack("kind").pack("request");
         packer.pack("schema_version").pack(schema_version);
-        return packer;
     }
 
     static zenoh::Session open(const std::string& endpoint, const std::string& zenoh_config) {
