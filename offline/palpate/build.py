@@ -14,14 +14,15 @@ from palpate.discretization.assembled_body import AssembledBody
 from palpate.discretization.resolution import resolved_frequency_hz
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.regions import ContactPatch
-from palpate.lti.pole_residue import DiagonalSystem
-from palpate.lti.sampling import discretize, sampled_response
+from palpate.lti.block_form import to_block_form
+from palpate.lti.pole_residue import PoleResidueSystem
+from palpate.lti.sampling import sample, sampled_response
 from palpate.lti.viscoelastic import viscoelastic_system
-from palpate.model_file import Contact, PoleResidueSystem, ReducedModel, StateSpace, Surface
+from palpate.model_file import Contact, ReducedModel, StateSpace, Surface
 from palpate.modes.dense import elastic_modes
 from palpate.modes.elastic_modes import ElasticModes
 from palpate.progress import NO_PROGRESS, Progress
-from palpate.reduction.accuracy import measure
+from palpate.reduction.accuracy import measure, refuse_meaningless
 from palpate.reduction.methods import Reduction, reduce
 from palpate.reduction.surface import fit_surface_output
 from palpate.scene.material import Material
@@ -46,7 +47,7 @@ class FullModel:
     patches: tuple[ContactPatch, ...]
     body: AssembledBody
     modes: ElasticModes
-    system: DiagonalSystem
+    system: PoleResidueSystem
 
 
 def build_model(config: Config, folder: Path, progress: Progress = NO_PROGRESS) -> ReducedModel:
@@ -57,19 +58,21 @@ def build_model(config: Config, folder: Path, progress: Progress = NO_PROGRESS) 
     """
     digest = fingerprint(config, folder)
     full = build_full_model(config, folder, progress)
-    reduction, discrete = _reduce(full.system, config.reduction, progress)
+    reduction, running = _reduce(full.system, config.reduction, progress)
+    discrete = to_block_form(running)
     surface, surface_error = _surface(full, discrete, config, progress)
     progress("accuracy")
     accuracy = measure(
         full.system,
         reduction,
-        discrete,
+        running,
         period_s=config.reduction.period_s,
         band_hz=config.reduction.band_hz,
         error_surface_in_band=surface_error,
         resolved_frequency_hz=resolved_frequency_hz(full.cloud, full.material),
     )
     progress.note(f"force error in band {100 * accuracy.error_in_band:.2g} %")
+    refuse_meaningless(accuracy, config.reduction.method)
     return ReducedModel(
         name=config.name,
         method=config.reduction.method,
@@ -77,9 +80,9 @@ def build_model(config: Config, folder: Path, progress: Progress = NO_PROGRESS) 
         n_nodes=full.cloud.n_nodes,
         n_states_full=full.system.n_states,
         contacts=tuple(_contact(t.name, p) for t, p in zip(config.contact, full.patches, strict=True)),
-        continuous=reduction.state_space,
+        continuous=to_block_form(reduction.system),
         discrete=discrete,
-        full=PoleResidueSystem(full.system.poles, full.system.b, full.system.c, full.system.d),
+        full=full.system,
         static_stiffness=full.modes.static_stiffness,
         surface=surface,
         accuracy=accuracy,
@@ -118,9 +121,9 @@ def build_full_model(config: Config, folder: Path, progress: Progress = NO_PROGR
 
 
 def _reduce(
-    system: DiagonalSystem, wanted: ReductionTable, progress: Progress
-) -> tuple[Reduction, StateSpace]:
-    """The reduced system, and the discrete model that runs."""
+    system: PoleResidueSystem, wanted: ReductionTable, progress: Progress
+) -> tuple[Reduction, PoleResidueSystem]:
+    """The reduced system, and the same sampled."""
     progress(f"reduction, {wanted.method}")
     period_s, rule, band_end_hz = wanted.period_s, wanted.sampling, wanted.band_hz[1]
     reduction = reduce(
@@ -131,8 +134,8 @@ def _reduce(
         band_hz=wanted.band_hz,
         response=lambda reduced, omega: sampled_response(reduced, omega, period_s, rule, band_end_hz),
     )
-    progress.note(f"{system.n_states:,} → {reduction.state_space.order} states")
-    return reduction, discretize(reduction.state_space, period_s, rule, band_end_hz)
+    progress.note(f"{system.n_states:,} → {reduction.order} states")
+    return reduction, sample(reduction.system, period_s, rule, band_end_hz)
 
 
 def _surface(

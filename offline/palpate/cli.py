@@ -80,7 +80,8 @@ def build(
         Path | None, typer.Option("--output", "-o", help="Model file; default: NAME.npz of the scene's name.")
     ] = None,
     method: Annotated[
-        str | None, typer.Option(help="tbr, tbr-band, modal or modal-static; default: the scene's.")
+        str | None,
+        typer.Option(help="tbr, tbr-band, hankel-optimal, modal or modal-static; default: the scene's."),
     ] = None,
     order: Annotated[int | None, typer.Option(help="Number of states of the reduced model.")] = None,
     tolerance: Annotated[
@@ -250,15 +251,12 @@ class Stages:
 
 def print_accuracy(model: ReducedModel) -> None:
     """The model and the report of its accuracy as a table."""
+    from palpate.reduction.accuracy import warnings
     from palpate.report import accuracy_table
 
     console.print(accuracy_table(model))
-    if model.accuracy.error_in_band > 0.5:
-        console.print(
-            f"[yellow]In the band this model is not the body: {model.method} at order {model.order} leaves the force wrong by "
-            f"{100 * model.accuracy.error_in_band:.0f} %. Raise the order, or use tbr-band.[/]",
-            highlight=False,
-        )
+    for warning in warnings(model):
+        console.print(f"[yellow]{warning}[/]", highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

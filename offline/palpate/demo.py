@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.build import build_model
-from palpate.lti.pole_residue import full_system
 from palpate.model_file import ModelFileError, ReducedModel, load_model, save_model
 from palpate.plots import Touch, draw_touch, require_matplotlib
 from palpate.progress import Progress
@@ -122,7 +121,7 @@ def read_touch(recording: Path, model: ReducedModel) -> Touch:
     # Force messages are best effort: the displacement of a tick that was not heard is interpolated.
     ticks = np.arange(heard[0], heard[-1] + 1)
     every = np.stack([np.interp(ticks, heard, channel) for channel in applied.T], axis=1)
-    exact = full_system(model.full).response(every, model.period_s)[heard - heard[0]]
+    exact = model.full.response(every, model.period_s)[heard - heard[0]]
     # The model's force is what the tip does to the tissue, the device's is its negative.
     return Touch((heard - heard[0]) * model.period_s, applied, force, -scale * exact)
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
+from palpate.lti.stepping import step_through
 from palpate.model_file import ReducedModel
 
 Array = NDArray[np.float64]
@@ -111,11 +112,7 @@ def draw_touch(model: ReducedModel, touch: Touch, contact: int, path: Path) -> N
 
 def surface_displacement(model: ReducedModel, displacement_m: Array) -> Array:
     """(n_vertices, 3), m: the surface after the displacements (n_ticks, n_inputs) have been applied from rest."""
-    a = model.discrete
-    partner = np.arange(a.order) ^ 1
-    state = np.zeros(a.order)
-    for u in displacement_m[:-1]:
-        state = a.diagonal * state + a.cross * state[partner] + a.b @ u
+    _, state = step_through(model.discrete, displacement_m[:-1])
     moved = model.surface.output @ state + model.surface.feedthrough @ displacement_m[-1]
     return np.asarray(moved, dtype=float).reshape(-1, 3)
 

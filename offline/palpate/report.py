@@ -47,6 +47,7 @@ def accuracy_table(model: ReducedModel) -> Table:
     table.add_row("error, H-infinity", percent(accuracy.error_hinf), "of the largest response")
     table.add_row("bound, H-infinity", bound, "a priori")
     table.add_row("error in time", marked(accuracy.error_time_domain), "force during a poke")
+    table.add_row("error after a jump", marked(accuracy.error_step), "of the static force, 0.2 s later")
     table.add_row("error of the surface", marked(accuracy.error_surface_in_band), "displacement in the band")
     table.add_row(
         "spectral abscissa",

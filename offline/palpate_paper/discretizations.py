@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.lti.pole_residue import DiagonalSystem
+from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.reduction.accuracy import hinf_error
 from palpate_paper.examples import Example, cube, disc, square
 from palpate_paper.figure import Cell, Figure, tidy
@@ -123,7 +123,7 @@ def _gain(example: Example) -> float:
     return float(example.system.static_gain()[example.channel, example.channel])
 
 
-def _state(system: DiagonalSystem) -> str:
+def _state(system: PoleResidueSystem) -> str:
     growing = int(np.count_nonzero(system.poles.real >= 0))
     return (
         f"stable, spectral abscissa {system.spectral_abscissa:.2g} 1/s"

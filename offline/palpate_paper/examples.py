@@ -12,7 +12,7 @@ from palpate.discretization import collocation, conservative
 from palpate.discretization.assembled_body import AssembledBody
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.shapes import box_lattice
-from palpate.lti.pole_residue import DiagonalSystem
+from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.modes.dense import elastic_modes
 from palpate.modes.elastic_modes import ElasticModes
@@ -53,7 +53,7 @@ class Example:
     """
 
     name: str
-    system: DiagonalSystem
+    system: PoleResidueSystem
     equations: EquationsOfMotion
     prony: PronySeries
     n_nodes: int
@@ -169,7 +169,7 @@ def pulse(duration_s: float) -> Array:
     return np.where(np.arange(len(times)) < round(0.2 / PERIOD_S), times / 10, 0.0)
 
 
-def with_drag(modes: ElasticModes, drag_per_s: float) -> DiagonalSystem:
+def with_drag(modes: ElasticModes, drag_per_s: float) -> PoleResidueSystem:
     """F = K_tt u - sum_k c_k b_k^T / (s² + c s + mu_k) u: an elastic body in a slightly viscous medium, two states a mode.
 
     Each mode must be underdamped: mu_k real and above c²/4, or complex in conjugate pairs.
@@ -192,7 +192,7 @@ def with_drag(modes: ElasticModes, drag_per_s: float) -> DiagonalSystem:
         columns.append(np.where(down[:, None], column.conj(), column))
         group.append(chosen)
     order = np.argsort(np.concatenate(group), kind="stable")
-    return DiagonalSystem(
+    return PoleResidueSystem(
         poles=np.concatenate(poles)[order],
         b=np.vstack(rows)[order],
         c=np.ascontiguousarray(np.vstack(columns)[order].T),

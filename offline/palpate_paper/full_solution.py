@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.lti.stepping import step_through
 from palpate_paper.examples import PERIOD_S, Example
-from palpate_paper.stepping import median_seconds, sampled, step_through
+from palpate_paper.stepping import median_seconds, sampled
 from palpate_paper.time_integration import newmark
 
 Array = NDArray[np.float64]

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.lti.block_form import diagonalize
-from palpate.lti.pole_residue import DiagonalSystem
-from palpate.reduction import (
-    ReducedSystem,
-    Reduction,
-    ReductionError,
-    balanced_truncation,
-    band_limited_truncation,
-    hankel_optimal,
-    reduce,
-    singular_perturbation_balancing,
-)
+from palpate.lti.pole_residue import PoleResidueSystem
+from palpate.reduction import Reduction, ReductionError, reduce
+from palpate.reduction.methods import Method as ReductionMethod
+from palpate.reduction.methods import balanced
 
 Band = tuple[float, float]
-Apply = Callable[[DiagonalSystem, Band, int], ReducedSystem | Reduction]
+Apply = Callable[[PoleResidueSystem, Band, int], Reduction]
+
+_EQUAL = 1e-6
+"""Hankel singular values this near to each other, relatively, are not separated by singular perturbation."""
 
 
 @dataclass(frozen=True)
@@ -51,34 +47,48 @@ class Method:
         }
 
 
-def _modal(system: DiagonalSystem, name: Literal["modal", "modal-static"], order: int) -> Reduction:
-    """With the bound that dropped modes have: |F - F_r| <= sum of |c_k b_k^T| / |Re lambda_k|, their statics kept or not."""
-    reduced = reduce(system, name, order=order)
-    dropped = system.take(~np.isin(system.group, reduced.system.group))
-    share = np.linalg.norm(dropped.b, axis=1) * np.linalg.norm(dropped.c, axis=0) / -dropped.poles.real
-    return replace(reduced, error_bound=float(np.sum(np.where(dropped.is_pair, 2, 1) * share)))
+def singular_perturbation_balancing(system: PoleResidueSystem, order: int) -> Reduction:
+    """The weak states of the balanced realization follow at once instead of being dropped: exact statics.
+
+    The bound is that of balanced truncation (Liu & Anderson 1989). Nearly equal Hankel singular values are kept or dropped
+    together: half of a lightly damped oscillator that follows at once has no meaning.
+
+    Raises ReductionError where the reduced system is not stable or its poles nearly coincide.
+    """
+    balancing = balanced(system)
+    orders = balancing.separated_orders(balancing.rank, _EQUAL)
+    r = int(orders[orders <= order][-1])
+    a, b, c, d = balancing.truncated(balancing.rank)
+    fast = np.linalg.solve(a[r:, r:], np.hstack([a[r:, :r], b[r:]]))
+    reduced = diagonalize(
+        a[:r, :r] - a[:r, r:] @ fast[:, :r],
+        b[:r] - a[:r, r:] @ fast[:, r:],
+        c[:, :r] - c[:, r:] @ fast[:, :r],
+        d - c[:, r:] @ fast[:, r:],
+    )
+    if not reduced.spectral_abscissa < 0:
+        raise ReductionError(
+            f"singular perturbation balancing to {r} states has a spectral abscissa of {reduced.spectral_abscissa:.3g} 1/s, "
+            "expected below 0: choose another order"
+        )
+    return Reduction("singular-perturbation", reduced, balancing.sigma, 2 * balancing.tail(r))
 
 
-HOM = Method("HOM", "Hankel-optimal", "tab:green", "s", lambda g, band, r: hankel_optimal(g, r))
-MT = Method(
-    "MT", "modal truncation", "tab:orange", "^", lambda g, band, r: _modal(g, "modal", r), marker_size=10
-)
+def _by(method: ReductionMethod) -> Apply:
+    return lambda system, band, order: reduce(system, method, order=order, band_hz=band)
+
+
+HOM = Method("HOM", "Hankel-optimal", "tab:green", "s", _by("hankel-optimal"))
+MT = Method("MT", "modal truncation", "tab:orange", "^", _by("modal"), marker_size=10)
 """The modes of lowest frequency, each with its memory; by modulus of the poles alone the slow memories would come first."""
 
-TBR = Method(
-    "TBR",
-    "truncated balanced realization",
-    "tab:red",
-    "o",
-    lambda g, band, r: balanced_truncation(g, r),
-    marker_size=8,
-)
+TBR = Method("TBR", "truncated balanced realization", "tab:red", "o", _by("tbr"), marker_size=8)
 MT_STATICS = Method(
     "MT+statics",
     "modal truncation with residual stiffness",
     "tab:brown",
     "v",
-    lambda g, band, r: _modal(g, "modal-static", r),
+    _by("modal-static"),
     marker_size=6,
 )
 SPB = Method(
@@ -86,15 +96,9 @@ SPB = Method(
     "singular perturbation balancing",
     "tab:purple",
     "D",
-    lambda g, band, r: singular_perturbation_balancing(g, r),
+    lambda system, band, order: singular_perturbation_balancing(system, order),
 )
-BAND = Method(
-    "band-limited",
-    "band-limited truncation",
-    "tab:blue",
-    "*",
-    lambda g, band, r: band_limited_truncation(g, band, r),
-)
+BAND = Method("band-limited", "band-limited truncation", "tab:blue", "*", _by("tbr-band"))
 
 OF_THE_PAPER = (HOM, MT, TBR)
 ALL = (*OF_THE_PAPER, MT_STATICS, SPB, BAND)
@@ -102,7 +106,7 @@ ALL = (*OF_THE_PAPER, MT_STATICS, SPB, BAND)
 
 @dataclass(frozen=True)
 class Reduced:
-    """A reduced model in diagonal form.
+    """A reduced model.
 
     order                   number of states that the method reached, at most what was asked for
     bound                   on the largest error over all frequencies, units of the response; None without
@@ -112,22 +116,20 @@ class Reduced:
 
     method: Method
     order: int
-    system: DiagonalSystem
+    system: PoleResidueSystem
     bound: float | None
     hankel_singular_values: NDArray[np.float64]
     seconds: float
 
 
-def reduce_by(method: Method, system: DiagonalSystem, band_hz: Band, order: int) -> Reduced | None:
+def reduce_by(method: Method, system: PoleResidueSystem, band_hz: Band, order: int) -> Reduced | None:
     """The reduced model, or None where the method has none of that order (it says so by ReductionError)."""
     start = time.perf_counter()
     try:
         reduced = method.apply(system, band_hz, order)
     except ReductionError:
         return None
-    plain = reduced.system
-    diagonal = plain if isinstance(plain, DiagonalSystem) else diagonalize(plain.a, plain.b, plain.c, plain.d)
     seconds = time.perf_counter() - start
     return Reduced(
-        method, reduced.order, diagonal, reduced.error_bound, reduced.hankel_singular_values, seconds
+        method, reduced.order, reduced.system, reduced.error_bound, reduced.hankel_singular_values, seconds
     )

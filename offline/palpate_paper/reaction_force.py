@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from palpate.lti.stepping import step_through
 from palpate_paper.examples import CUBE_SINE_HZ, PERIOD_S
 from palpate_paper.figure import Figure, tidy
 from palpate_paper.methods import OF_THE_PAPER, TBR
-from palpate_paper.stepping import sampled, step_through
+from palpate_paper.stepping import sampled
 from palpate_paper.study import Study, per_cent
 
 _TABLE_STRIDE = 10
@@ -22,7 +23,7 @@ def reaction_force(study: Study) -> Figure:
     wanted = [(m, example.order) for m in OF_THE_PAPER] + [(TBR, example.small_order)]
     models = [r for r in (study.reduced(example, m, n) for m, n in wanted) if r is not None]
     k = example.channel
-    forces = [step_through(sampled(m.system, PERIOD_S), example.inputs)[:, k] for m in models]
+    forces = [step_through(sampled(m.system, PERIOD_S), example.inputs)[0][:, k] for m in models]
     labels = [f"{m.method.name}_{m.order}" for m in models]
     times = example.times_s
     largest = float(np.max(np.abs(full.exact)))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.lti.viscoelastic import mode_poles
 from palpate.modes.elastic_modes import ElasticModes
 from palpate.scene.material import PronySeries
 
@@ -33,7 +33,7 @@ def stability(modes: ElasticModes, prony: PronySeries) -> Stability:
     mu = np.asarray(modes.squared_frequencies, dtype=np.complex128)
     size = np.abs(mu)
     round_off = np.finfo(np.float64).eps * size.max()
-    real = _poles(mu, prony).real.max(axis=1)
+    real = mode_poles(mu, prony).real.max(axis=1)
     moving = size > 1e3 * round_off  # rigid modes are zero to round-off: neither growing nor curable
     ratio = np.abs(mu.imag[moving]) / size[moving]
     complex_pairs = np.abs(mu.imag) > 1e3 * round_off
@@ -46,22 +46,3 @@ def stability(modes: ElasticModes, prony: PronySeries) -> Stability:
         largest_imaginary_part=float(ratio.max(initial=0.0)),
         curing_damping_per_s=float(damping[complex_pairs | (moving & (mu.real <= 0))].max(initial=0.0)),
     )
-
-
-def _poles(squared_frequencies: NDArray[np.complex128], prony: PronySeries) -> NDArray[np.complex128]:
-    """(n_modes, n_terms + 2), 1/s: the roots of s² + mu h(s) = 0 for every mu of squared_frequencies (n_modes,), (rad/s)².
-
-    Eigenvalues of the mode's own states u, v / |mu|^½ and the memories z_j: exact, no polynomial in s is formed.
-    """
-    mu = squared_frequencies
-    omega = np.sqrt(np.abs(mu))
-    direction = np.divide(mu, omega, out=np.zeros_like(mu), where=omega > 0)
-    n_terms = len(prony.gamma)
-    a = np.zeros((len(mu), n_terms + 2, n_terms + 2), dtype=np.complex128)
-    a[:, 0, 1] = omega
-    a[:, 1, 0] = -direction
-    for j, (gamma, tau) in enumerate(zip(prony.gamma, prony.tau_s, strict=True), start=2):
-        a[:, 1, j] = -gamma * direction
-        a[:, j, 1] = omega
-        a[:, j, j] = -1 / tau
-    return np.linalg.eigvals(a).astype(np.complex128)

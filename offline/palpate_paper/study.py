@@ -14,12 +14,13 @@ from palpate.lti.frequencies import (
     relative_errors,
     spectral_norms,
 )
-from palpate.lti.pole_residue import DiagonalSystem
+from palpate.lti.pole_residue import PoleResidueSystem
+from palpate.lti.stepping import step_through
 from palpate.reduction.accuracy import hinf_error, in_band_error
 from palpate_paper.examples import PERIOD_S, Example, cube, disc, square
 from palpate_paper.full_solution import FullSolution, solve_in_full
 from palpate_paper.methods import OF_THE_PAPER, Method, Reduced, reduce_by
-from palpate_paper.stepping import median_seconds, sampled, step_through
+from palpate_paper.stepping import median_seconds, sampled
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ class Study:
         full, small = example.system, reduced.system
         model = sampled(small, PERIOD_S)
         exact = self.solution(example).exact
-        stepped = step_through(model, example.inputs)[:, example.channel]
+        stepped = step_through(model, example.inputs)[0][:, example.channel]
         largest = np.max(spectral_norms(full.transfer(1j * all_frequencies((full,)))))
         return Comparison(
             reduced,
@@ -137,7 +138,7 @@ class Study:
         )
 
 
-def static_error(full: DiagonalSystem, small: DiagonalSystem) -> float:
+def static_error(full: PoleResidueSystem, small: PoleResidueSystem) -> float:
     """|F(0) - F_r(0)| / |F(0)|."""
     zero = np.zeros(1, dtype=np.complex128)
     return float(relative_errors(full.transfer(zero), small.transfer(zero))[0])

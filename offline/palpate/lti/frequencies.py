@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.lti.pole_residue import DiagonalSystem
+from palpate.lti.pole_residue import PoleResidueSystem
 
 Array = NDArray[np.float64]
 
 
-def band_frequencies(systems: tuple[DiagonalSystem, ...], band_hz: tuple[float, float]) -> Array:
+def band_frequencies(systems: tuple[PoleResidueSystem, ...], band_hz: tuple[float, float]) -> Array:
     """`frequencies_near` the poles of all the systems."""
     return frequencies_near(np.concatenate([s.poles for s in systems]), band_hz)
 
@@ -26,7 +26,7 @@ def frequencies_near(poles: NDArray[np.complex128], band_hz: tuple[float, float]
     return np.unique(omega[(omega >= low) & (omega <= high)])
 
 
-def all_frequencies(systems: tuple[DiagonalSystem, ...]) -> Array:
+def all_frequencies(systems: tuple[PoleResidueSystem, ...]) -> Array:
     """(n,), rad/s, ascending: 0, 600 points even in log frequency across all poles, and every resonance."""
     magnitudes = np.concatenate([np.abs(s.poles) for s in systems])
     resonances = np.concatenate([s.poles.imag[s.is_pair] for s in systems])
@@ -42,6 +42,8 @@ def all_frequencies(systems: tuple[DiagonalSystem, ...]) -> Array:
 
 def spectral_norms(matrices: NDArray[np.complex128] | Array) -> Array:
     """(n,): largest singular value of each of the matrices (n, p, m)."""
+    if not matrices.size:  # no inputs or no outputs: nothing is amplified
+        return np.zeros(len(matrices))
     return np.linalg.norm(matrices, ord=2, axis=(1, 2))
 
 
@@ -71,5 +73,9 @@ def maximum(function: Callable[[Array], Array], omega: Array, n_peaks: int = 12)
 
 
 def relative_errors(full: NDArray[np.complex128] | Array, other: NDArray[np.complex128] | Array) -> Array:
-    """(n,): |full - other| / |full|, 2-norms, of responses (n, n_outputs, n_inputs) at the same frequencies."""
-    return spectral_norms(full - other) / spectral_norms(full)
+    """(n,): |full - other| / |full|, 2-norms, of responses (n, n_outputs, n_inputs) at the same frequencies.
+
+    Where full is zero: 0 if other is zero as well, else infinite.
+    """
+    error, gain = spectral_norms(full - other), spectral_norms(full)
+    return np.divide(error, gain, out=np.where(error > 0, np.inf, 0.0), where=gain > 0)

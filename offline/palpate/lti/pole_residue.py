@@ -1,4 +1,7 @@
-"""A real linear time-invariant system in diagonal (pole-residue) form: its frequency and exact time response."""
+"""A real linear time-invariant system in pole-residue form: its frequency response and its exact response in time.
+
+Continuous or discrete: of a discrete system the poles are those of z, and `transfer` is evaluated at z = e^{j omega T}.
+"""
 
 from __future__ import annotations
 
@@ -6,39 +9,39 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
-
-from palpate.model_file import PoleResidueSystem
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
+_CHUNK = 1 << 22
+"""Complex numbers in the largest temporary array of a response, about 64 MiB."""
+
 
 @dataclass(frozen=True)
-class DiagonalSystem:
-    """F(s) = D + sum_k c_k b_k^T / (s - lambda_k), a pole off the real axis counting with its conjugate.
+class PoleResidueSystem:
+    """F(s) = D + sum_k c_k b_k^T / (s - p_k), a pole off the real axis counting with its conjugate.
 
     poles  (n_poles,), complex, 1/s, Im >= 0: one with Im > 0 stands for itself and its complex conjugate
     b      (n_poles, n_inputs), complex; of a real pole the product c_k b_k^T is real
     c      (n_outputs, n_poles), complex
     d      (n_outputs, n_inputs), real
-    group  (n_poles,), integers, ascending: poles of one group belong together and are truncated together
+    group  (n_poles,), integers, ascending: poles of one group belong to one elastic mode; None: each pole its own
     """
 
     poles: Complex
     b: Complex
     c: Complex
     d: Array
-    group: NDArray[np.int64]
+    group: NDArray[np.int64] | None = None
 
     @property
     def n_inputs(self) -> int:
-        return self.b.shape[1]
+        return self.d.shape[1]
 
     @property
     def n_outputs(self) -> int:
-        return self.c.shape[0]
+        return self.d.shape[0]
 
     @property
     def is_pair(self) -> NDArray[np.bool_]:
@@ -60,16 +63,23 @@ class DiagonalSystem:
         """Largest real part of the poles, 1/s; minus infinity without poles."""
         return float(np.max(self.poles.real, initial=-np.inf))
 
+    @property
+    def residues(self) -> Complex:
+        """(n_poles, n_outputs, n_inputs): c_k b_k^T, real for real poles."""
+        products: Complex = np.einsum("pk,km->kpm", self.c, self.b)
+        products.imag[~self.is_pair] = 0.0
+        return products
+
     def transfer(self, s: NDArray[np.complexfloating[Any, Any]]) -> Complex:
         """(n_points, n_outputs, n_inputs): F at the points s (n_points,), 1/s, none of them a pole."""
-        residues = self._residues()
-        values = _sum_partial_fractions(
-            np.ascontiguousarray(s, dtype=np.complex128),
-            np.ascontiguousarray(self.poles),
-            np.ascontiguousarray(residues.real),
-            np.ascontiguousarray(residues.imag),
-        )
-        return self.d + values.reshape(len(s), self.n_outputs, self.n_inputs)
+        residues = self.residues.reshape(len(self.poles), self.n_outputs * self.n_inputs)
+        paired = self.is_pair
+        out = np.zeros((len(s), residues.shape[1]), dtype=np.complex128)
+        for part in _chunks(len(s), len(self.poles)):
+            points = np.asarray(s[part], dtype=np.complex128)[:, None]
+            out[part] = (1 / (points - self.poles)) @ residues
+            out[part] += (1 / (points - self.poles[paired].conj())) @ residues[paired].conj()
+        return self.d + out.reshape(len(s), self.n_outputs, self.n_inputs)
 
     def static_gain(self) -> Array:
         """(n_outputs, n_inputs): F(0)."""
@@ -77,11 +87,13 @@ class DiagonalSystem:
 
     def step_response(self, times_s: Array) -> Array:
         """(n_times, n_outputs, n_inputs): exact response, t >= 0, of a system at rest to unit steps at t = 0."""
-        residues = np.where(self.is_pair, 2.0, 1.0)[:, None] * self._residues()
-        response = np.empty((len(times_s), residues.shape[1]))
-        for i, t in enumerate(times_s):
-            response[i] = np.real((np.expm1(self.poles * t) / self.poles) @ residues)
-        return self.d + response.reshape(len(times_s), self.n_outputs, self.n_inputs)
+        residues = (self._weights / self.poles)[:, None] * self.residues.reshape(
+            len(self.poles), self.n_outputs * self.n_inputs
+        )
+        out = np.zeros((len(times_s), residues.shape[1]))
+        for part in _chunks(len(times_s), len(self.poles)):
+            out[part] = (np.expm1(times_s[part, None] * self.poles) @ residues).real
+        return self.d + out.reshape(len(times_s), self.n_outputs, self.n_inputs)
 
     def response(self, inputs: Array, period_s: float) -> Array:
         """(n_samples, n_outputs): exact response to the piecewise linear input through the samples.
@@ -90,41 +102,48 @@ class DiagonalSystem:
                 and the input rises linearly from zero to it.
         """
         decay, old, new = first_order_hold(self.poles * period_s)
-        weight = np.where(self.is_pair, 2.0, 1.0)
-        forced = _propagate(
-            np.ascontiguousarray(inputs, dtype=np.float64),
-            decay,
-            np.ascontiguousarray((period_s * old)[:, None] * self.b),
-            np.ascontiguousarray((period_s * new)[:, None] * self.b),
-            np.ascontiguousarray((weight * self.c).T),
-        )
-        return forced + inputs @ self.d.T
+        before = np.vstack([np.zeros((1, self.n_inputs)), inputs[:-1]])
+        b_old, b_new = ((period_s * w)[:, None] * self.b for w in (old, new))
+        state = np.zeros(len(self.poles), dtype=np.complex128)
+        out = inputs @ self.d.T
+        for part in _chunks(len(inputs), len(self.poles)):
+            states = before[part] @ b_old.T + inputs[part] @ b_new.T
+            for row in states:
+                state *= decay
+                state += row
+                row[:] = state
+            out[part] += (states @ (self._weights * self.c).T).real
+        return out
 
-    def take(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> DiagonalSystem:
+    def take(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> PoleResidueSystem:
         """The system with the chosen poles only, D unchanged."""
-        return DiagonalSystem(
-            self.poles[chosen], self.b[chosen], self.c[:, chosen], self.d, self.group[chosen]
-        )
+        group = None if self.group is None else self.group[chosen]
+        return PoleResidueSystem(self.poles[chosen], self.b[chosen], self.c[:, chosen], self.d, group)
 
-    def _residues(self) -> Complex:
-        """(n_poles, n_outputs n_inputs): c_k b_k^T, real for real poles."""
-        products = np.einsum("pk,km->kpm", self.c, self.b)
-        residues = products.reshape(len(self.poles), self.n_outputs * self.n_inputs)
-        residues.imag[~self.is_pair] = 0.0
-        return residues
+    @property
+    def _weights(self) -> Array:
+        """(n_poles,): how often the real part of a pole's contribution counts."""
+        return np.where(self.is_pair, 2.0, 1.0)
 
 
-def full_system(full: PoleResidueSystem) -> DiagonalSystem:
-    """The unreduced system that a model file keeps."""
-    return DiagonalSystem(full.poles, full.b, full.c, full.d, np.arange(len(full.poles)))
+def phases(rows: Complex) -> Complex:
+    """(n,): the phase factor of the entry of largest modulus in each of the rows (n, k); 1 for a row of zeros."""
+    if not rows.shape[1]:
+        return np.ones(len(rows), dtype=np.complex128)
+    largest = np.take_along_axis(rows, np.argmax(np.abs(rows), axis=1, keepdims=True), axis=1)[:, 0]
+    return np.where(largest != 0, largest / np.where(largest != 0, np.abs(largest), 1), 1)
 
 
-def first_order_hold(
-    z: Complex,
-) -> tuple[Complex, Complex, Complex]:
-    """(e^z, phi_1 - phi_2, phi_2) for z = lambda T, each (n,): weights of the old state, old and new input.
+def _chunks(n: int, width: int) -> list[slice]:
+    """Slices that cover 0..n, each of at most `_CHUNK` entries when an entry of n has `width` of them."""
+    step = max(1, _CHUNK // max(1, width))
+    return [slice(i, min(i + step, n)) for i in range(0, n, step)]
 
-    x(T) = e^z x(0) + T ((phi_1 - phi_2) u(0) + phi_2 u(T)) solves dx/dt = lambda x + u exactly for linear u, with
+
+def first_order_hold(z: Complex) -> tuple[Complex, Complex, Complex]:
+    """(e^z, phi_1 - phi_2, phi_2) for z = p T, each (n,): weights of the old state, old and new input.
+
+    x(T) = e^z x(0) + T ((phi_1 - phi_2) u(0) + phi_2 u(T)) solves dx/dt = p x + u exactly for linear u, with
     phi_1 = (e^z - 1) / z and phi_2 = (e^z - 1 - z) / z². Near z = 0, where these cancel, by their Taylor series.
     """
     decay: Complex = np.exp(z)
@@ -139,52 +158,3 @@ def first_order_hold(
     phi_2 = np.where(near, series, phi_2)
     phi_1 = np.where(near, 1.0 + small * series, phi_1)
     return decay, phi_1 - phi_2, phi_2
-
-
-@njit(parallel=True, cache=True)
-def _sum_partial_fractions(s, poles, real, imag):  # type: ignore[no-untyped-def]
-    """(n_points, n_channels): sum of R/(s - lambda), for pairs plus conj(R)/(s - conj(lambda)), R = real + j imag."""
-    n_channels = real.shape[1]
-    out = np.zeros((s.shape[0], n_channels), dtype=np.complex128)
-    for i in prange(s.shape[0]):
-        total = np.zeros(2 * n_channels)
-        for k in range(poles.shape[0]):
-            direct = 1.0 / (s[i] - poles[k])
-            if poles[k].imag > 0:
-                mirror = 1.0 / (s[i] - np.conj(poles[k]))
-                even = direct + mirror
-                odd = 1j * (direct - mirror)
-                for q in range(n_channels):
-                    total[2 * q] += real[k, q] * even.real + imag[k, q] * odd.real
-                    total[2 * q + 1] += real[k, q] * even.imag + imag[k, q] * odd.imag
-            else:
-                for q in range(n_channels):
-                    total[2 * q] += real[k, q] * direct.real
-                    total[2 * q + 1] += real[k, q] * direct.imag
-        for q in range(n_channels):
-            out[i, q] = complex(total[2 * q], total[2 * q + 1])
-    return out
-
-
-@njit(parallel=True, cache=True)
-def _propagate(inputs, decay, b_old, b_new, c):  # type: ignore[no-untyped-def]
-    """(n_samples, n_outputs): sum over the poles of Re(c x), x+ = decay x + b_old u + b_new u+."""
-    n_samples, n_inputs = inputs.shape
-    n_poles, n_outputs = c.shape
-    n_chunks = 16
-    partial = np.zeros((n_chunks, n_samples, n_outputs))
-    for chunk in prange(n_chunks):
-        for k in range(chunk, n_poles, n_chunks):
-            x = 0j
-            for t in range(n_samples):
-                x = decay[k] * x
-                for m in range(n_inputs):
-                    x += b_new[k, m] * inputs[t, m]
-                    if t > 0:
-                        x += b_old[k, m] * inputs[t - 1, m]
-                for p in range(n_outputs):
-                    partial[chunk, t, p] += c[k, p].real * x.real - c[k, p].imag * x.imag
-    out = np.zeros((n_samples, n_outputs))
-    for chunk in range(n_chunks):
-        out += partial[chunk]
-    return out

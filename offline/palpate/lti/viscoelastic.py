@@ -17,7 +17,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
-from palpate.lti.pole_residue import DiagonalSystem
+from palpate.lti.pole_residue import PoleResidueSystem, phases
 from palpate.modes.elastic_modes import ElasticModes
 from palpate.scene.material import PronySeries
 
@@ -28,7 +28,7 @@ RealOrComplex = NDArray[Any]
 _SYMMETRY_TOLERANCE = 1e-10  # of the largest entry: what a symmetric computation leaves by round-off
 
 
-def viscoelastic_system(modes: ElasticModes, prony: PronySeries) -> DiagonalSystem:
+def viscoelastic_system(modes: ElasticModes, prony: PronySeries) -> PoleResidueSystem:
     """The system from patch displacement (m) to reaction force (N), with all memory states.
 
     Its groups are the relaxation of the static stiffness (0), then the modes by ascending |mu| (1, 2, ...); complex mu
@@ -52,7 +52,7 @@ def viscoelastic_system(modes: ElasticModes, prony: PronySeries) -> DiagonalSyst
         static, direct = (static + static.T) / 2, (direct + direct.T) / 2
 
     relaxation, stress = _prony_polynomials(prony)
-    poles = _roots(mu, relaxation, stress)
+    poles = mode_poles(mu, prony)
     residues = _residues(poles, mu, relaxation, stress)
     if not np.all(np.isfinite(residues)):
         worst = int(np.argmax(~np.all(np.isfinite(residues), axis=1)))
@@ -83,7 +83,7 @@ def viscoelastic_system(modes: ElasticModes, prony: PronySeries) -> DiagonalSyst
         memory_poles.append(np.full(n_channels, -1 / tau, dtype=np.complex128))
         memory_b.append(root[:, None] * right)
         memory_c.append(root[:, None] * left.T)
-    return DiagonalSystem(
+    return PoleResidueSystem(
         poles=np.concatenate([*memory_poles, poles]),
         b=np.concatenate([*memory_b, poles_b]),
         c=np.ascontiguousarray(np.concatenate([*memory_c, poles_c]).T),
@@ -123,8 +123,7 @@ def _half_of_conjugates(
     c = modes.output_coupling[:, kept].astype(np.complex128)
     # The eigenvectors of a real mode may carry any complex factor, which c b^T does not: take it off.
     real = mu.imag == 0
-    largest = np.take_along_axis(b, np.argmax(np.abs(b), axis=1)[:, None], axis=1)[:, 0]
-    phase = np.where(real & (largest != 0), largest / np.where(largest != 0, np.abs(largest), 1), 1)
+    phase = np.where(real, phases(np.asarray(b, dtype=np.complex128)), 1)
     b, c = b / phase[:, None], c * phase
     b[real], c[:, real] = b[real].real, c[:, real].real
     return mu, b, c
@@ -145,11 +144,13 @@ def _prony_polynomials(prony: PronySeries) -> tuple[Array, Array]:
     return relaxation, stress
 
 
-def _roots(mu: RealOrComplex, relaxation: Array, stress: Array) -> Complex:
-    """(n_modes, M + 2): the roots of s² P + mu N, companion eigenvalues polished by Newton's method.
+def mode_poles(mu: RealOrComplex, prony: PronySeries) -> Complex:
+    """(n_modes, M + 2), 1/s: the roots of s² P + mu N for squared frequencies mu (n_modes,), (rad/s)²; mu = 0 is allowed.
 
-    Those of a real mu are exactly real or in exact conjugate pairs: all steps are the same for a root's conjugate.
+    Companion eigenvalues, polished by Newton's method. Those of a real mu are exactly real or in exact conjugate pairs:
+    all steps are the same for a root's conjugate.
     """
+    relaxation, stress = _prony_polynomials(prony)
     degree = len(relaxation) + 1
     roots = np.empty((len(mu), degree), dtype=np.complex128)
     for of_kind in (mu.imag == 0, mu.imag != 0):

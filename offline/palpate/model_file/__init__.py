@@ -3,6 +3,7 @@
 The package needs numpy and the standard library only, so that a server can load a model without the offline libraries.
 """
 
+from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.model_file.read import load_model
 from palpate.model_file.types import (
     LONGEST_PERIOD_S,
@@ -10,7 +11,6 @@ from palpate.model_file.types import (
     AccuracyReport,
     Contact,
     ModelFileError,
-    PoleResidueSystem,
     ReducedModel,
     StateSpace,
     Surface,

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.files import printable
+from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.model_file.check import check_model, refuse
 from palpate.model_file.members import (
     ARRAYS,
@@ -32,7 +33,6 @@ from palpate.model_file.types import (
     AccuracyReport,
     Contact,
     ModelFileError,
-    PoleResidueSystem,
     ReducedModel,
     StateSpace,
     Surface,

@@ -8,6 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.lti.pole_residue import PoleResidueSystem
+
 FORMAT = "palpate.reduced-model"
 SCHEMA_VERSION = 2
 
@@ -67,28 +69,18 @@ class StateSpace:
     def order(self) -> int:
         return len(self.diagonal)
 
+    @property
+    def n_padding(self) -> int:
+        """1 where a real pole has a partner that nothing drives and nothing sees, else 0."""
+        idle = (self.cross == 0) & np.all(self.b == 0, axis=1) & np.all(self.c == 0, axis=0)
+        return int(np.any(idle[1::2]))
+
     def dense_a(self) -> Array:
         """(order, order), the state matrix A."""
         a = np.diag(self.diagonal)
         i = np.arange(self.order)
         a[i, i ^ 1] = self.cross
         return a
-
-
-@dataclass(frozen=True)
-class PoleResidueSystem:
-    """The full model, kept beside the reduced one so that anyone can check what the server answers:
-
-        F(s) = D + sum_i c_i b_i^T / (s - p_i), each pole above the real axis standing for its conjugate too.
-
-    poles (n_poles,), imaginary part >= 0, 1/s
-    b (n_poles, n_inputs), c (n_outputs, n_poles), complex; d (n_outputs, n_inputs), N/m
-    """
-
-    poles: NDArray[np.complex128]
-    b: NDArray[np.complex128]
-    c: NDArray[np.complex128]
-    d: Array
 
 
 @dataclass(frozen=True)
@@ -118,6 +110,8 @@ class AccuracyReport:
     error_static           the same at 0 Hz
     error_hinf             largest over all frequencies of |F_full - F_reduced|, over the largest |F_full|
     error_bound            a-priori bound in the norm of error_hinf, or None where the method has none
+    error_step             after a jump of the tip, the largest force error from 0.2 s on over the static force; the exact
+                           response counts the poles beyond half the sampling rate, which no sample follows, at rest
     error_time_domain      on a poke: largest force error over the largest force, discrete model against exact response
     error_surface_in_band  surface displacement in the band: largest over the frequencies of |error| over |displacement|
     spectral_abscissa      largest real part of the reduced poles, 1/s
@@ -137,6 +131,7 @@ class AccuracyReport:
     error_static: float
     error_hinf: float
     error_bound: float | None
+    error_step: float
     error_time_domain: float
     error_surface_in_band: float
     spectral_abscissa: float
@@ -156,7 +151,7 @@ class ReducedModel:
     continuous  the reduced model dx/dt = A x + B u, F = C x + D u (u displacement in m, F force in N)
     discrete    the same sampled at period_s, in the form that runs:
                 F = C xi + D u, then xi+ = A xi + B u with the newest sample u
-    full        the model that was reduced; nothing at run time needs it
+    full        the model that was reduced; nothing at run time needs it, and a file does not hold its poles' groups
     static_stiffness (n_outputs, n_inputs), N/m, of the full model; instant stiffness is continuous.d
     config      the configuration it was built from, defaults filled in, as JSON; config_sha256 is the hash of that
                 and of the surface file

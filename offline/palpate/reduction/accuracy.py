@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.lti.block_form import from_block_form
+from palpate.lti.block_form import to_block_form
+from palpate.lti.errors import ReductionError
 from palpate.lti.frequencies import (
     all_frequencies,
     band_frequencies,
@@ -13,20 +14,27 @@ from palpate.lti.frequencies import (
     relative_errors,
     spectral_norms,
 )
-from palpate.lti.pole_residue import DiagonalSystem
-from palpate.model_file import AccuracyReport, StateSpace
+from palpate.lti.pole_residue import PoleResidueSystem
+from palpate.lti.stepping import step_through
+from palpate.model_file import AccuracyReport, ReducedModel
 from palpate.reduction.methods import Reduction
 from palpate.reduction.passivity import largest_energy_out, passive_up_to, passivity_margin
 
 Array = NDArray[np.float64]
 
+NOTABLE_ERROR = 0.1
+"""A relative error above this is not what a model is built for: the build warns."""
+
 _POKE_AMPLITUDE_M = 1e-3
+
+_SETTLED_S = 0.2
+"""When the force after a jump is compared: about a hand's reaction time later."""
 
 
 def measure(
-    full: DiagonalSystem,
+    full: PoleResidueSystem,
     reduction: Reduction,
-    discrete: StateSpace,
+    running: PoleResidueSystem,
     *,
     period_s: float,
     band_hz: tuple[float, float],
@@ -35,10 +43,9 @@ def measure(
 ) -> AccuracyReport:
     """The accuracy report that goes with a model; `palpate.model_file.AccuracyReport` defines each figure.
 
-    discrete  the reduction's state space discretized at period_s
+    running  the reduced system sampled at period_s
     The surface error and the resolved frequency are passed on.
     """
-    running = from_block_form(discrete)
     errors, largest = _hinf(full, reduction.system)
     in_band = band_frequencies((full, reduction.system), band_hz)
     zero = np.zeros(1, dtype=np.complex128)
@@ -53,7 +60,8 @@ def measure(
         error_static=float(relative_errors(full.transfer(zero), reduction.system.transfer(zero))[0]),
         error_hinf=errors / largest,
         error_bound=None if bound is None else bound / largest,
-        error_time_domain=time_domain_error(full, discrete, poke(full.n_inputs, period_s, band_hz), period_s),
+        error_step=step_error(full, running, period_s),
+        error_time_domain=time_domain_error(full, running, poke(full.n_inputs, period_s, band_hz), period_s),
         error_surface_in_band=error_surface_in_band,
         spectral_abscissa=reduction.system.spectral_abscissa,
         spectral_abscissa_full=full.spectral_abscissa,
@@ -66,7 +74,7 @@ def measure(
     )
 
 
-def in_band_error(full: DiagonalSystem, reduced: DiagonalSystem, omega: Array) -> float:
+def in_band_error(full: PoleResidueSystem, reduced: PoleResidueSystem, omega: Array) -> float:
     """Largest |F - F_reduced| / |F| over the frequencies omega, rad/s, refined around its peaks."""
 
     def error(w: Array) -> Array:
@@ -75,13 +83,13 @@ def in_band_error(full: DiagonalSystem, reduced: DiagonalSystem, omega: Array) -
     return maximum(error, omega)[1]
 
 
-def hinf_error(full: DiagonalSystem, reduced: DiagonalSystem) -> float:
+def hinf_error(full: PoleResidueSystem, reduced: PoleResidueSystem) -> float:
     """Largest |F - F_reduced| over all frequencies over the largest |F|, by adaptive sampling, infinity included."""
     error, largest = _hinf(full, reduced)
     return error / largest
 
 
-def _hinf(full: DiagonalSystem, reduced: DiagonalSystem) -> tuple[float, float]:
+def _hinf(full: PoleResidueSystem, reduced: PoleResidueSystem) -> tuple[float, float]:
     """(max |F - F_reduced|, max |F|) over all frequencies."""
     omega = all_frequencies((full, reduced))
 
@@ -112,24 +120,71 @@ def poke(n_inputs: int, period_s: float, band_hz: tuple[float, float]) -> Array:
     return 1e-3 * samples
 
 
-def time_domain_error(full: DiagonalSystem, discrete: StateSpace, inputs: Array, period_s: float) -> float:
-    """Largest force error over the largest force: the discrete model, stepped, against the full exact response."""
+def time_domain_error(
+    full: PoleResidueSystem, running: PoleResidueSystem, inputs: Array, period_s: float
+) -> float:
+    """Largest force error over the largest force: the running model, stepped, against the full exact response."""
     exact = full.response(inputs, period_s)
-    stepped = step_through(discrete, inputs)
+    stepped, _ = step_through(to_block_form(running), inputs)
     error = np.linalg.norm(stepped - exact, axis=1)
     return float(np.max(error) / np.max(np.linalg.norm(exact, axis=1)))
 
 
-def step_through(discrete: StateSpace, inputs: Array) -> Array:
-    """(n_samples, n_outputs): F = C xi + D u, then xi+ = A xi + B u for each sample u of inputs, from xi = 0."""
-    partner = np.arange(discrete.order) ^ 1
-    driven = inputs @ discrete.b.T
-    states = np.empty((len(inputs), discrete.order))
-    xi = np.zeros(discrete.order)
-    for k in range(len(inputs)):
-        states[k] = xi
-        xi = discrete.diagonal * xi + discrete.cross * xi[partner] + driven[k]
-    return states @ discrete.c.T + inputs @ discrete.d.T
+def step_error(full: PoleResidueSystem, running: PoleResidueSystem, period_s: float) -> float:
+    """Largest |F_running - F| over |F(0)| after a jump of the tip, over 1,000 samples from 0.2 s on (2-norms).
+
+    F is the exact step response of the full model's poles within half the sampling rate and the static response of those
+    beyond: no sample can follow them, so what the running model makes of them has to be gone.
+    """
+    samples = np.ceil(_SETTLED_S / period_s) + np.arange(1000)
+    slow = full.take(np.abs(full.poles) < np.pi / period_s)
+    exact = slow.step_response(samples * period_s) + full.static_gain() - slow.static_gain()
+    # sum_{j<k} C A^j B + D, a geometric series for each pole
+    weights = np.where(running.is_pair, 2.0, 1.0) / (1 - running.poles)
+    powers = 1 - running.poles ** samples[:, None]
+    stepped = running.d + np.einsum("tk,kpm->tpm", powers * weights, running.residues).real
+    error = float(np.max(spectral_norms(stepped - exact)))
+    return error / float(spectral_norms(full.static_gain()[None])[0])
+
+
+def refuse_meaningless(accuracy: AccuracyReport, method: str) -> None:
+    """Raises ReductionError where the force is wrong by more than 100 % in the band or at 0 Hz, or by no finite number.
+
+    A model that always answers zero is wrong by 100 %: one beyond that is worse than none.
+    """
+    for error, where in ((accuracy.error_in_band, "in the band"), (accuracy.error_static, "at 0 Hz")):
+        if not error <= 1:
+            raise ReductionError(
+                f"the reduced model's force is wrong by {100 * error:.3g} % {where}, expected at most 100 %, what a model "
+                f"that always answers zero has: {_advice(method)}, or check the material's constants"
+            )
+
+
+def warnings(model: ReducedModel) -> tuple[str, ...]:
+    """What a person should know before using the model, a sentence each; empty where there is nothing."""
+    accuracy, advice = model.accuracy, _advice(model.method)
+    low, high = accuracy.band_hz
+    found = []
+    if accuracy.error_in_band > NOTABLE_ERROR:
+        found.append(
+            f"In {low:g}-{high:g} Hz the force is wrong by up to {100 * accuracy.error_in_band:.0f} %: {advice}."
+        )
+    if accuracy.error_static > NOTABLE_ERROR:
+        found.append(f"At 0 Hz the force is wrong by {100 * accuracy.error_static:.0f} %: {advice}.")
+    if accuracy.error_step > NOTABLE_ERROR:
+        found.append(
+            f"After a jump of the tip the force is wrong by up to {100 * accuracy.error_step:.0f} % of the static force for "
+            "0.2 s and longer: the body rings near half the sampling rate; give the material a branch of short tau_s."
+        )
+    if model.continuous.n_padding:
+        found.append(
+            f"Order {model.order - 1} is stored as {model.order}: the form that runs has blocks of two states, and one is padding."
+        )
+    return tuple(found)
+
+
+def _advice(method: str) -> str:
+    return "raise the order" if method == "tbr-band" else "raise the order or use tbr-band"
 
 
 def _smooth_step(x: Array) -> Array:

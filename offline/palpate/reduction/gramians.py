@@ -1,4 +1,4 @@
-"""Low-rank factors of the Gramians of a diagonal system, in real coordinates.
+"""Low-rank factors of the Gramians of a system in pole-residue form, in real coordinates.
 
 Real coordinates: a real pole has one state; a pair has two, sqrt(2) Re x and sqrt(2) Im x of the complex state x of its
 upper pole, so that the change of basis is unitary. Its block of A is [[a, -w], [w, a]] for the pole a + jw. States
@@ -7,16 +7,20 @@ follow the order of the poles.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.lti.pole_residue import DiagonalSystem
-from palpate.reduction.balancing import Gramians, missing_in_sum
+from palpate.lti.pole_residue import PoleResidueSystem
 
 Array = NDArray[np.float64]
+
+GRAMIAN_TOLERANCE = 1e-20
+"""Trace of what a Gramian factor leaves out, relative to the Gramian's. Hankel singular values are off by about its
+square root at worst, so this keeps them to 1e-10 of the largest."""
 
 BAND_FREQUENCIES = 120
 """Points over a band without narrow resonances, about; 30 panels, of a fraction of an octave each."""
@@ -30,7 +34,7 @@ _MOST_RESONANCES = 60
 
 @dataclass(frozen=True)
 class RealForm:
-    """A diagonal system in real coordinates.
+    """A system in real coordinates.
 
     decay, rotation  (n_states,): A x = decay * x + rotation * x[partner]
     partner          (n_states,), the other state of a pair; the state itself for a real pole
@@ -51,9 +55,20 @@ class RealForm:
         """A x for x (n_states, k)."""
         return self.decay[:, None] * x + self.rotation[:, None] * x[self.partner]
 
-    def mass(self, x: Array) -> Array:
-        """E x = x."""
-        return x
+
+@dataclass(frozen=True)
+class Gramians:
+    """Factors of the two Gramians, control control^T and observe observe^T, in real coordinates.
+
+    control (n_states, k), observe (n_states, l)
+    missing    what the Hankel singular values can differ by in sum from those of the whole Gramians
+    symmetric  whether observe is control times signs, so that observe^T control is symmetric
+    """
+
+    control: Array
+    observe: Array
+    missing: float = 0.0
+    symmetric: bool = False
 
 
 @dataclass(frozen=True)
@@ -70,7 +85,7 @@ class GramianFactor:
     residual: float
 
 
-def real_form(system: DiagonalSystem) -> RealForm:
+def real_form(system: PoleResidueSystem) -> RealForm:
     """The system in real coordinates (exact; see the module's text)."""
     start, is_pair = _first_state(system), system.is_pair
     n = system.n_states
@@ -93,7 +108,7 @@ def real_form(system: DiagonalSystem) -> RealForm:
     return RealForm(decay, rotation, partner, b, c, system.d, signature)
 
 
-def controllability_factor(system: DiagonalSystem, tolerance: float) -> GramianFactor:
+def controllability_factor(system: PoleResidueSystem, tolerance: float) -> GramianFactor:
     """Factor of P, A P + P A^T + B B^T = 0, until the trace of the rest is below tolerance times that of P.
 
     Pivoted Cholesky of the Cauchy-form Gramian P_kl = -b_k b_l^* / (lambda_k + conj(lambda_l)). Its Schur complements
@@ -106,14 +121,14 @@ def controllability_factor(system: DiagonalSystem, tolerance: float) -> GramianF
     return _cauchy_factor(system, system.b, tolerance)
 
 
-def observability_factor(system: DiagonalSystem, tolerance: float) -> GramianFactor:
+def observability_factor(system: PoleResidueSystem, tolerance: float) -> GramianFactor:
     """Factor of Q, A^T Q + Q A + C^T C = 0, as `controllability_factor`."""
     signature = real_form(system).signature
     dual = _cauchy_factor(system, np.ascontiguousarray(system.c.T), tolerance)
     return GramianFactor(signature[:, None] * dual.factor, dual.trace, dual.residual)
 
 
-def gramians(system: DiagonalSystem, tolerance: float) -> Gramians:
+def gramians(system: PoleResidueSystem, tolerance: float = GRAMIAN_TOLERANCE) -> Gramians:
     """Both factors; of a symmetric system (C = B^T, Q = S P S with the signature S) the second comes with the first."""
     control = controllability_factor(system, tolerance)
     if system.is_symmetric:
@@ -122,12 +137,12 @@ def gramians(system: DiagonalSystem, tolerance: float) -> Gramians:
         )
     else:
         observe = observability_factor(system, tolerance)
-    missing = missing_in_sum((control.trace, control.residual), (observe.trace, observe.residual))
+    missing = _missing_in_sum((control.trace, control.residual), (observe.trace, observe.residual))
     return Gramians(control.factor, observe.factor, missing, system.is_symmetric)
 
 
 def band_controllability_factor(
-    system: DiagonalSystem, band: tuple[float, float], n_frequencies: int = BAND_FREQUENCIES
+    system: PoleResidueSystem, band: tuple[float, float], n_frequencies: int = BAND_FREQUENCIES
 ) -> Array:
     """(n_states, k): L with L L^T about the controllability Gramian limited to the band; k is 2 n_inputs a frequency.
 
@@ -194,13 +209,23 @@ def _edges_around_resonances(band: tuple[float, float], poles: NDArray[np.comple
     return np.asarray(edges[(np.abs(offsets) <= narrow.imag[:, None] / 10) & (edges > low) & (edges < high)])
 
 
-def _first_state(system: DiagonalSystem) -> NDArray[np.intp]:
+def _missing_in_sum(control: tuple[float, float], observe: tuple[float, float]) -> float:
+    """How far in sum the singular values of factors can be from the whole's, from (trace, trace left out) of each Gramian.
+
+    With P = L L^T + R and Q likewise, the factors of the whole have more blocks, whose nuclear norms are at most the
+    products of Frobenius norms, and singular values differ in sum by no more than that (Mirsky 1960).
+    """
+    (p, p_rest), (q, q_rest) = control, observe
+    return math.sqrt(q * p_rest) + math.sqrt(p * q_rest) + math.sqrt(p_rest * q_rest)
+
+
+def _first_state(system: PoleResidueSystem) -> NDArray[np.intp]:
     """(n_poles,): index of each pole's first real state."""
     sizes = np.where(system.is_pair, 2, 1)
     return np.cumsum(sizes) - sizes
 
 
-def _in_real_coordinates(system: DiagonalSystem, rows: NDArray[np.complex128]) -> Array:
+def _in_real_coordinates(system: PoleResidueSystem, rows: NDArray[np.complex128]) -> Array:
     """(n_states, k) from complex rows (n_poles, k)."""
     start, is_pair = _first_state(system), system.is_pair
     out = np.empty((system.n_states, rows.shape[1]))
@@ -210,7 +235,9 @@ def _in_real_coordinates(system: DiagonalSystem, rows: NDArray[np.complex128]) -
     return out
 
 
-def _cauchy_factor(system: DiagonalSystem, rows: NDArray[np.complex128], tolerance: float) -> GramianFactor:
+def _cauchy_factor(
+    system: PoleResidueSystem, rows: NDArray[np.complex128], tolerance: float
+) -> GramianFactor:
     if not system.spectral_abscissa < 0:
         raise ValueError(
             f"the spectral abscissa is {system.spectral_abscissa:.3g} 1/s: Gramians exist for poles in the open left "

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.lti.frequencies import maximum, spectral_norms
-from palpate.lti.pole_residue import DiagonalSystem
+from palpate.lti.pole_residue import PoleResidueSystem
 
 Array = NDArray[np.float64]
 
@@ -25,17 +25,17 @@ Array = NDArray[np.float64]
 _NEGLIGIBLE = 1e-3
 
 
-def passivity_margin(discrete: DiagonalSystem) -> float:
+def passivity_margin(discrete: PoleResidueSystem) -> float:
     """Smallest eigenvalue of (G - G^H)/2j over all frequencies, over |G(1)|, the static stiffness.
 
     discrete  the discrete response G(z), z = e^{j omega T}. Zero or above (but for round-off): no closed sinusoidal
               poke gets energy out.
     """
-    _, worst = maximum(lambda theta: -_least_dissipation(discrete, theta)[0], _angles(discrete))
+    _, worst = maximum(lambda theta: -_least_dissipation(discrete, theta), _angles(discrete))
     return -worst / float(spectral_norms(discrete.transfer(np.ones(1, dtype=np.complex128)))[0])
 
 
-def passive_up_to(discrete: DiagonalSystem) -> float:
+def passive_up_to(discrete: PoleResidueSystem) -> float:
     """Angle a sample, 0..pi, below which no sinusoidal poke gets energy out; pi where none does at any.
 
     What stays below a thousandth of the static stiffness does not count: a reduction that is not exactly symmetric
@@ -43,7 +43,7 @@ def passive_up_to(discrete: DiagonalSystem) -> float:
     """
     theta = _angles(discrete)
     static = float(spectral_norms(discrete.transfer(np.ones(1, dtype=np.complex128)))[0])
-    active = np.flatnonzero(_least_dissipation(discrete, theta)[0] < -_NEGLIGIBLE * static)
+    active = np.flatnonzero(_least_dissipation(discrete, theta) < -_NEGLIGIBLE * static)
     if not len(active):
         return float(np.pi)
     # Where it begins lies between this sample and the one before: bisect.
@@ -51,40 +51,30 @@ def passive_up_to(discrete: DiagonalSystem) -> float:
     low = theta[active[0] - 1] if active[0] else 0.0
     for _ in range(40):
         middle = (low + high) / 2
-        if _least_dissipation(discrete, np.array([middle]))[0][0] < -_NEGLIGIBLE * static:
+        if _least_dissipation(discrete, np.array([middle]))[0] < -_NEGLIGIBLE * static:
             high = middle
         else:
             low = middle
     return float(low)
 
 
-def largest_energy_out(discrete: DiagonalSystem, amplitude_m: float) -> float:
+def largest_energy_out(discrete: PoleResidueSystem, amplitude_m: float) -> float:
     """Largest work, J, that one closed sinusoidal poke of |a| = amplitude_m gets out; 0 where none does."""
 
     def energy(theta: Array) -> Array:
-        return -np.pi * np.sinc(theta / np.pi) * _least_dissipation(discrete, theta)[0]
+        return -np.pi * np.sinc(theta / np.pi) * _least_dissipation(discrete, theta)
 
     return max(0.0, maximum(energy, _angles(discrete))[1]) * amplitude_m**2
 
 
-def worst_poke(discrete: DiagonalSystem) -> tuple[float, NDArray[np.complex128]]:
-    """(theta, a): angle per sample and unit complex amplitudes (n_inputs,) of the poke that gets most energy out."""
-
-    def energy(theta: Array) -> Array:
-        return -np.sinc(theta / np.pi) * _least_dissipation(discrete, theta)[0]
-
-    theta, _ = maximum(energy, _angles(discrete))
-    return theta, _least_dissipation(discrete, np.array([theta]))[1][0]
-
-
-def _least_dissipation(discrete: DiagonalSystem, theta: Array) -> tuple[Array, NDArray[np.complex128]]:
-    """Smallest eigenvalue (n,) of (G - G^H)/2j at the angles theta (n,) and its eigenvector (n, n_inputs)."""
+def _least_dissipation(discrete: PoleResidueSystem, theta: Array) -> Array:
+    """(n,): smallest eigenvalue of (G - G^H)/2j at the angles theta (n,); 0 without inputs."""
     g = discrete.transfer(np.exp(1j * theta))
-    values, vectors = np.linalg.eigh((g - np.conj(np.swapaxes(g, 1, 2))) / 2j)
-    return values[:, 0], vectors[:, :, 0]
+    eigenvalues = np.linalg.eigvalsh((g - np.conj(np.swapaxes(g, 1, 2))) / 2j)
+    return np.asarray(np.min(eigenvalues, axis=1, initial=np.inf if g.shape[1] else 0.0))
 
 
-def _angles(discrete: DiagonalSystem) -> Array:
+def _angles(discrete: PoleResidueSystem) -> Array:
     """(n,), ascending in 0..pi: statics, 1,000 points even in the logarithm, 200 even ones, and all resonances."""
     slowest = float(np.min(np.abs(1 - discrete.poles), initial=1.0))
     resonances = np.angle(discrete.poles[discrete.is_pair])

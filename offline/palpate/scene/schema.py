@@ -17,7 +17,7 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
 Count = Annotated[int, Field(strict=True)]
 Point = tuple[Number, Number, Number]
-ReductionMethod = Literal["tbr", "tbr-band", "modal", "modal-static"]
+ReductionMethod = Literal["tbr", "tbr-band", "hankel-optimal", "modal", "modal-static"]
 
 
 MAX_NODES = 100_000

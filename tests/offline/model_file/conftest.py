@@ -63,6 +63,7 @@ def _small_model() -> ReducedModel:
             error_static=0.001,
             error_hinf=0.02,
             error_bound=None,
+            error_step=0.004,
             error_time_domain=0.003,
             error_surface_in_band=0.05,
             spectral_abscissa=-1.0,

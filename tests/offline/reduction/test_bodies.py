@@ -8,12 +8,11 @@ import pytest
 from palpate.build import build_model
 from palpate.discretization import collocation, conservative
 from palpate.geometry.shapes import box_lattice
-from palpate.lti.block_form import diagonalize
 from palpate.lti.frequencies import band_frequencies
-from palpate.lti.pole_residue import DiagonalSystem, full_system
+from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.modes.dense import elastic_modes
-from palpate.reduction import hankel_optimal, reduce
+from palpate.reduction import reduce
 from palpate.reduction.accuracy import hinf_error, in_band_error
 from palpate.reduction.balancing import balance
 from palpate.reduction.gramians import gramians, real_form
@@ -58,15 +57,13 @@ def test_balanced_truncation_of_the_cube_with_a_thousand_nodes_is_below_one_perc
 @pytest.mark.slow
 def test_hankel_optimal_reduction_of_eight_thousand_states_reaches_the_next_singular_value():
     _, full = cube(10, conservative)
-    reduced = hankel_optimal(full, 100)
-    plain = reduced.system
-    other = diagonalize(plain.a, plain.b, plain.c, plain.d)
-    difference = DiagonalSystem(
+    reduced = reduce(full, "hankel-optimal", order=100)
+    other = reduced.system
+    difference = PoleResidueSystem(
         np.concatenate([full.poles, other.poles]),
         np.concatenate([full.b, other.b]),
         np.concatenate([full.c, -other.c], axis=1),
         full.d - other.d,
-        np.arange(len(full.poles) + len(other.poles)),
     )
     hankel_norm = balance(real_form(difference), gramians(difference, 1e-20)).sigma[0]
     assert hankel_norm == pytest.approx(reduced.hankel_singular_values[reduced.order], rel=1e-6)
@@ -120,11 +117,12 @@ def test_the_shipped_liver_is_within_two_percent_at_order_120_and_plain_balancin
     model = build_model(config, folder)
     assert model.n_nodes >= 1000
     assert model.contacts[0].n_nodes >= 19
-    assert model.accuracy.error_in_band < 0.02
-    assert model.accuracy.error_static < 0.02
+    assert model.accuracy.error_in_band < 0.00635  # as docs/validation.md says
+    assert model.accuracy.error_static < 0.00095
+    assert model.accuracy.error_step < 0.02
     assert model.accuracy.error_surface_in_band < 0.25
     assert model.accuracy.passive_up_to_hz > 10 * config.reduction.band_hz[1]
-    full = full_system(model.full)
+    full = model.full
     plain = reduce(full, "tbr", order=120)
     assert static_error(full, plain.system) > 1  # why band-limited balancing is the default for organs
     assert hinf_error(full, plain.system) <= plain.error_bound / np.linalg.norm(full.d, 2)
