@@ -293,10 +293,10 @@ def report_with(**changes):
 
 
 @pytest.mark.parametrize("field", ["error_in_band", "error_static"])
-@pytest.mark.parametrize("error", [1.43, 5e14, np.inf, np.nan])
-def test_a_model_worse_than_one_that_answers_zero_is_refused(field, error):
-    refuse_meaningless(report_with(**{field: 0.99}), "tbr")
-    with pytest.raises(ReductionError, match=r"force is wrong by .* %.*expected at most 100 %") as refusal:
+@pytest.mark.parametrize("error", [101.0, 5e14, np.inf, np.nan])
+def test_a_model_whose_force_is_round_off_is_refused(field, error):
+    refuse_meaningless(report_with(**{field: 13.0}), "tbr")
+    with pytest.raises(ReductionError, match=r"force is wrong by .* %.*expected at most 10000 %") as refusal:
         refuse_meaningless(report_with(**{field: error}), "tbr-band")
     assert "tbr-band" not in str(refusal.value)  # advice never names what is in use
 
@@ -319,6 +319,7 @@ def test_a_model_is_warned_about_with_the_number_and_what_to_do(full):
     assert "43 %" in in_band
     assert "tbr-band" in in_band
     assert "tbr-band" not in told(error_in_band=0.43)[0]
+    assert "143 % (a model that always answers zero" in told(error_in_band=1.43)[0]
     assert "12 %" in told(error_static=0.12)[0]
     assert "rings" in told(error_step=0.5)[0]
 

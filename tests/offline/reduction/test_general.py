@@ -169,11 +169,7 @@ def test_an_order_between_equal_singular_values_goes_down_to_where_they_differ()
     # Balancing in doubles: the two copies of a singular value differ by round-off.
     sigma = balance(real_form(twin), gramians(twin)).sigma
     assert sigma[4] == pytest.approx(sigma[5], rel=1e-9)
-    try:
-        reduced = reduce(twin, "hankel-optimal", order=5)
-    except ReductionError as error:  # twin poles of the reduced system: no diagonal form is to be trusted
-        assert "condition number" in str(error)
-        return
+    reduced = reduce(twin, "hankel-optimal", order=5)
     assert reduced.order == 4
     assert hankel_norm(difference(twin, reduced.system)) == pytest.approx(sigma[4], rel=1e-6)
 

@@ -308,7 +308,10 @@ def test_an_unstable_body_is_refused_with_its_spectral_abscissa():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"method": "balanced", "order": 4}, "method = 'balanced': expected one of tbr, tbr-band, modal"),
+        (
+            {"method": "balanced", "order": 4},
+            "method = 'balanced': expected one of tbr, tbr-band, hankel-optimal, modal",
+        ),
         ({"method": "tbr"}, "expected exactly one"),
         ({"method": "tbr", "order": 4, "tolerance": 0.1}, "expected exactly one"),
         ({"method": "tbr", "order": 0}, "order = 0"),
