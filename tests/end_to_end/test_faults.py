@@ -15,9 +15,8 @@ from typing import Any
 
 import pytest
 
-from palpate_server import wire
+from palpate_client.wire import Flags, pack
 from palpate_server.diagnostics.round_trips import free_endpoint
-from palpate_server.realtime.safety import Flags
 
 # Of the server below. A press of DEPTH_M (50 N/m when it has settled, more before) goes beyond the largest force, and
 # one tick may change it by a fiftieth of that: the lowest rate that is accepted, so a step beyond it has room to show.
@@ -92,11 +91,12 @@ def test_a_clients_clock_that_jumps_changes_nothing_but_the_echo(
         assert client.acquire("tip")[0]
         for sequence in range(1, 400):
             message = {
+                "kind": "command",
                 "sequence": sequence,
                 "client_time_ns": jumps[sequence % len(jumps)],
-                "displacement_m": {"tip": [0.0, 0.0, DEPTH_M]},
+                "position_m": {"tip": [0.0, 0.0, DEPTH_M]},
             }
-            client.put(wire.pack(message))
+            client.put(pack(message))
             time.sleep(0.001)
         client.status_when(lambda status: status["accepted"] == 399, "all commands")
         answered = [m for m in client.forces if m["sequence"][0] > 0]
@@ -127,7 +127,7 @@ def test_reordered_and_repeated_commands_never_move_the_tip_back(
         check(client.forces)
 
 
-def test_of_two_clients_fighting_for_a_contact_one_moves_it(served: Any, connect: Callable[..., Any]) -> None:
+def test_of_two_clients_fighting_for_a_tool_one_moves_it(served: Any, connect: Callable[..., Any]) -> None:
     with connect(served.endpoint) as first, connect(served.endpoint) as second:
         assert first.acquire("tip")[0]
         for i in range(200):
@@ -142,7 +142,7 @@ def test_of_two_clients_fighting_for_a_contact_one_moves_it(served: Any, connect
         )
         assert status["accepted"] == 200
         assert status["refused"]["not_holder"] == 200
-        moved = [m["displacement_m"][0][2] for m in first.forces]
+        moved = [m["position_m"][0][2] for m in first.forces]
         assert min(moved) >= 0
         check(first.forces)
 

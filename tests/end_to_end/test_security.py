@@ -8,7 +8,6 @@ import shutil
 import socket
 import ssl
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,12 +17,12 @@ import zenoh
 from mcap.reader import make_reader
 
 from palpate.model_file import save_model
-from palpate_server import wire
+from palpate_client.wire import Keys, pack
 from palpate_server.diagnostics.round_trips import free_endpoint
 from palpate_server.diagnostics.sample_model import spring_mass_model
 
 EXAMPLE = Path(__file__).parents[2] / "configs" / "security"
-KEYS = wire.Keys("main")
+KEYS = Keys("main")
 
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificates")
 
@@ -136,29 +135,31 @@ def assert_powerless(client: Any) -> None:
     """The server is not asked, its counters stay as they are, and the tool stays where it is."""
     before = client.status_when(
         lambda status: (
-            status["contacts"]["tip"]["holder"] is None and status["contacts"]["tip"]["success_rate"] == 0
+            status["tools"]["tip"]["holder"] is None and status["tools"]["tip"]["success_rate"] == 0
         ),
         "nobody at the tool",
     )
     first = len(client.forces)
     for action, request in (
-        ("acquire", {"contacts": ["tip"]}),
+        ("acquire", {"tools": ["tip"]}),
         ("release", {}),
         ("limits", {"limits": {"max_force_n": 1.0}}),
         ("reset", {}),
-        ("load", {"model": "model.npz"}),
-        ("record", {}),
+        ("load", {"file": "model.npz"}),
+        ("record", {"file": None}),
     ):
         with pytest.raises(TimeoutError):
-            client.control(action, request)
+            client.control(action, **request)
     for _ in range(100):
         client.command({"tip": [0.0, 0.0, -0.001]})
-    time.sleep(0.2)  # for what must not happen
+    assert client.query("describe")[
+        0
+    ]  # on the same link, and behind the commands: they have come as far as they do
     after = client.next_status()
     for counter in ("accepted", "refused", "malformed"):
         assert after[counter] == before[counter]
-    assert after["contacts"] == before["contacts"]
-    assert not any(any(message["displacement_m"][0]) for message in client.forces[first:])
+    assert after["tools"] == before["tools"]
+    assert not any(any(message["position_m"][0]) for message in client.forces[first:])
 
 
 @pytest.mark.usefixtures("server")
@@ -273,9 +274,9 @@ def test_nobody_hears_an_observer(connect_as: Callable[..., Any]) -> None:
         before = operator.next_status()
         for key in (KEYS.force, KEYS.status, KEYS.surface, KEYS.command("operator")):
             for _ in range(10):
-                observer.session.put(key, wire.pack({"forged": True}))
+                observer.session.put(key, pack({"forged": True}))
         observer.session.liveliness().declare_token(KEYS.server).undeclare()
-        time.sleep(0.2)  # for what must not happen
+        assert observer.query("describe")[0]  # behind all that, on the same link
         after = operator.next_status()
         assert not any("forged" in message for message in operator.forces + operator.statuses)
         assert after["malformed"] == before["malformed"]
@@ -284,9 +285,33 @@ def test_nobody_hears_an_observer(connect_as: Callable[..., Any]) -> None:
 
 
 @pytest.mark.usefixtures("server")
+def test_an_observer_that_declares_thousands_of_keys_costs_an_operator_nothing(
+    connect_as: Callable[..., Any],
+) -> None:
+    with connect_as("operator") as operator, connect_as("observer") as observer:
+        assert operator.acquire("tip")[0]
+        with operator.pressing({"tip": [0.0, 0.0, -0.001]}):
+            operator.force_when(lambda force: force["force_scale"][0] == 1, "the force in full")
+            before = operator.next_status()
+            declared = [
+                observer.session.declare_subscriber(f"palpate/x{i}/force", lambda sample: None)
+                for i in range(2000)
+            ]
+            tokens = [
+                observer.session.liveliness().declare_token(f"palpate/main/client/x{i}") for i in range(2000)
+            ]
+            assert observer.query("describe")[0]  # behind the declarations, on the same link
+            after = operator.next_status()
+        assert len(declared) == len(tokens) == 2000
+        assert after["tools"]["tip"]["holder"] == "operator"
+        assert after["dropped"]["unsent_force"] == before["dropped"]["unsent_force"]
+        assert after["skipped_ticks"] == before["skipped_ticks"]
+
+
+@pytest.mark.usefixtures("server")
 def test_an_observer_cannot_keep_an_operators_lease(connect_as: Callable[..., Any]) -> None:
     def holder(status: dict[str, Any]) -> object:
-        return status["contacts"]["tip"]["holder"]
+        return status["tools"]["tip"]["holder"]
 
     with connect_as("observer", "operator") as observer:  # its token, too, is on palpate/main/client/operator
         with connect_as("operator") as operator:
@@ -314,4 +339,4 @@ def test_two_operators_act_each_under_its_own_name(
         assert first.control("release")[0]
         assert second.acquire("tip")[0]
         with second.pressing({"tip": [0.0, 0.0, -0.001]}):
-            second.force_when(lambda force: any(force["displacement_m"][0]), "a movement")
+            second.force_when(lambda force: any(force["position_m"][0]), "a movement")

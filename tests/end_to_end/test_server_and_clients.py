@@ -15,6 +15,7 @@ import subprocess
 import threading
 import time
 import urllib.request
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,9 +26,9 @@ import numpy as np
 import pytest
 
 from palpate.model_file import save_model
+from palpate_client.wire import Flags
 from palpate_server.diagnostics.round_trips import free_endpoint
 from palpate_server.diagnostics.sample_model import spring_mass_model
-from palpate_server.realtime.safety import Flags
 from palpate_server.recording.replay import read_session
 
 LIMITS_MET = int(
@@ -49,7 +50,7 @@ def has_flag(flag: Flags) -> Callable[[dict[str, Any]], bool]:
     return lambda force: bool(force["flags"][0] & flag)
 
 
-def test_forces_through_the_wire_are_the_models_response_to_the_applied_displacements(
+def test_forces_through_the_wire_are_the_tissues_answer_to_the_applied_positions(
     serve: Callable[..., Any], connect: Callable[..., Any], run_example: Callable[..., Any], tmp_path: Path
 ) -> None:
     """Forces are best effort. So what each tick applied is told by the server's recording, in which none is missing."""
@@ -62,14 +63,14 @@ def test_forces_through_the_wire_are_the_models_response_to_the_applied_displace
         options = ("--duration-s", "2", "--json", "--record", str(heard))
         code, out, err = run_example("palpate_client.poke", served.endpoint, *options).finish()
         assert code == 0, err
-        assert client.control("record", {"file": None})[1]["error"] is None
+        assert client.control("record", file=None)[1]["recording"]["error"] is None
     summary = json.loads(out)
     assert summary["contract_broken"] == []
     assert summary["commands_answered"] > 0
     assert summary["round_trip_s"]["p50"] > 0
 
     system, (first, *_) = served.model.discrete, (recorded := read_session(tmp_path / "ticks.mcap").forces)
-    applied = np.array([tick["displacement_m"][0] for tick in recorded])
+    applied = np.array([tick["position_m"][0] for tick in recorded])
     assert not np.any(applied[0])  # recorded from before the first displacement: the model was at rest
     assert np.abs(applied).max() == pytest.approx(0.005, rel=1e-3)
     state, a = np.zeros(system.order), system.dense_a()
@@ -88,11 +89,11 @@ def test_forces_through_the_wire_are_the_models_response_to_the_applied_displace
     assert not np.any(flags & LIMITS_MET)
     scale = np.array([float(row["tip.force_scale"]) for row in rows])
     assert scale.max() == 1
-    displacement = np.array([[float(row[f"tip.displacement_{axis}_m"]) for axis in "xyz"] for row in rows])
+    displacement = np.array([[float(row[f"tip.position_{axis}_m"]) for axis in "xyz"] for row in rows])
     np.testing.assert_array_equal(displacement, applied[known])
     force = np.array([[float(row[f"tip.force_{axis}_n"]) for axis in "xyz"] for row in rows])
     np.testing.assert_allclose(
-        force, scale[:, None] * expected[known], rtol=0, atol=1e-12 * np.abs(expected).max()
+        force, -scale[:, None] * expected[known], rtol=0, atol=1e-12 * np.abs(expected).max()
     )
 
 
@@ -108,9 +109,7 @@ def test_force_is_zero_within_a_tenth_of_a_second_after_the_client_is_killed(
     served = serve()
     slow = ("--duration-s", "60", "--frequency-hz", "0.1")
     with connect(served.endpoint) as observer:
-        for _ in range(
-            5
-        ):  # on a busy machine its last commands, or the ticks, may come late, but not each time
+        for _ in range(5):
             client = run_example("palpate_client.poke", served.endpoint, *slow)
             observer.force_when(lambda force: in_full(force) and np.any(force["force_n"]), "the force")
             killed_ns = time.monotonic_ns()
@@ -120,11 +119,8 @@ def test_force_is_zero_within_a_tenth_of_a_second_after_the_client_is_killed(
             after = [m for m in list(observer.forces) if m["server_time_ns"] >= killed_ns]
             zero = next(i for i, m in enumerate(after) if not np.any(m["force_n"]))
             assert not any(np.any(m["force_n"]) for m in after[zero:])
-            observer.status_when(lambda s: s["contacts"]["tip"]["holder"] is None, "a free contact")
-            if after[zero]["server_time_ns"] - killed_ns < 100e6:
-                break
-        else:
-            raise AssertionError("the force took longer than 0.1 s to fade, five times")
+            assert after[zero]["server_time_ns"] - killed_ns < 100e6
+            observer.status_when(lambda s: s["tools"]["tip"]["holder"] is None, "a free tool")
         assert observer.acquire("tip")[0]
 
 
@@ -136,15 +132,15 @@ def test_a_client_that_pauses_for_half_a_second_is_faded_out_and_softly_in_again
     with connect(served.endpoint) as observer:
         client = run_example("palpate_client.poke", served.endpoint, *slow)
         observer.force_when(in_full, "the force in full")
-        assert observer.control("record", {"file": "pause.mcap"})[0]
+        assert observer.control("record", file="pause.mcap")[0]
         client.process.send_signal(signal.SIGSTOP)
         stopped_ns = time.monotonic_ns()
         time.sleep(0.5)
         resumed_ns = time.monotonic_ns()
         client.process.send_signal(signal.SIGCONT)
         observer.force_when(in_full, "the force in full again")
-        state = observer.next_status()["contacts"]["tip"]
-        assert observer.control("record", {"file": None})[1]["error"] is None
+        state = observer.next_status()["tools"]["tip"]
+        assert observer.control("record", file=None)[1]["recording"]["error"] is None
     assert state["holder"] is not None  # half a second is no reason to lose the lease
     assert 0 < state["success_rate_since_start"] < 1
 
@@ -185,17 +181,17 @@ def test_a_client_without_a_server_says_so(run_example: Callable[..., Any]) -> N
 def malformed_payloads(count: int) -> list[bytes]:
     """Every kind of wrong, from one seed: random, truncated, wrong type, wrong shape, not finite, huge."""
     generator = random.Random(0)
-    good = {"sequence": 1, "client_time_ns": 1, "displacement_m": {"tip": [0.0, 0.0, 0.0]}}
+    good = {"kind": "command", "sequence": 1, "client_time_ns": 1, "position_m": {"tip": [0.0, 0.0, 0.0]}}
     whole = msgpack.packb(good)
     kinds: list[Callable[[], bytes]] = [
         lambda: generator.randbytes(generator.randrange(200)),
         lambda: whole[: generator.randrange(len(whole))],
         lambda: msgpack.packb(good | {"sequence": "one"}),
-        lambda: msgpack.packb(good | {"displacement_m": [1, 2]}),
-        lambda: msgpack.packb(good | {"displacement_m": {"tip": [0.0] * generator.randrange(3)}}),
-        lambda: msgpack.packb(good | {"displacement_m": {"tip": [float("nan"), 0.0, 0.0]}}),
-        lambda: msgpack.packb(good | {"displacement_m": {"tip": [1e308, 1e308, float("inf")]}}),
-        lambda: msgpack.packb(good | {"displacement_m": {generator.randbytes(3).hex(): [0.0, 0.0, 0.0]}}),
+        lambda: msgpack.packb(good | {"position_m": [1, 2]}),
+        lambda: msgpack.packb(good | {"position_m": {"tip": [0.0] * generator.randrange(3)}}),
+        lambda: msgpack.packb(good | {"position_m": {"tip": [float("nan"), 0.0, 0.0]}}),
+        lambda: msgpack.packb(good | {"position_m": {"tip": [1e308, 1e308, float("inf")]}}),
+        lambda: msgpack.packb(good | {"position_m": {generator.randbytes(3).hex(): [0.0, 0.0, 0.0]}}),
         lambda: bytes(5000),
         lambda: msgpack.packb(generator.randrange(10**9)),
     ]
@@ -236,7 +232,7 @@ def test_a_request_that_is_too_large_is_refused_before_it_is_read(
     shared_server: Any, connect: Callable[..., Any], size: int
 ) -> None:
     with connect(shared_server.endpoint) as client:
-        granted, refusal = client.control("acquire", {"contacts": ["tip"], "remark": "x" * size})
+        granted, refusal = client.acquire("tip", remark="x" * size)
         assert not granted
         assert refusal["reason"] == "too_large"
         assert "expected at most 16384" in refusal["message"]
@@ -245,7 +241,7 @@ def test_a_request_that_is_too_large_is_refused_before_it_is_read(
         assert client.acquire("tip")[0]
 
 
-def test_old_sequences_and_others_contacts_are_refused(
+def test_old_sequences_and_others_tools_are_refused(
     serve: Callable[..., Any], connect: Callable[..., Any]
 ) -> None:
     served = serve(n_contacts=2)
@@ -264,39 +260,84 @@ def test_old_sequences_and_others_contacts_are_refused(
             lambda status: status["accepted"] + sum(status["refused"].values()) == 5, "all commands"
         )
         assert status["accepted"] == 1
-        assert status["refused"]["unknown_contact"] == 1
+        assert status["refused"]["unknown_tool"] == 1
         assert status["refused"]["old_sequence"] == 2
         assert status["refused"]["not_holder"] == 1
-        assert first.control("release") == (True, {"contacts": ["tip"]})
+        assert first.control("release") == (True, {"kind": "answer", "tools": ["tip"]})
         assert second.acquire("tip")[0]
 
 
 @pytest.mark.parametrize(
-    ("key", "request_", "reason"),
+    ("key", "fields", "reason"),
     [
-        ("nobody/acquire", {"contacts": ["tip"]}, "not_alive"),
-        ("no.body/acquire", {"contacts": ["tip"]}, "wrong_type"),
-        ("*/acquire", {"contacts": ["tip"]}, "wrong_type"),
-        ("nobody/acquire", {"contacts": "tip"}, "wrong_type"),
-        ("nobody/acquire", None, "missing_field"),
-        ("nobody/acquire", {"contacts": ["tip"], "frame": {"scale": 0}}, "out_of_range"),
-        ("nobody/acquire", {"contacts": ["tip"], "round_trip_s": -1}, "out_of_range"),
+        ("nobody/acquire", {"tools": ["tip"]}, "not_alive"),
+        ("no.body/acquire", {"tools": ["tip"]}, "unknown_action"),
+        ("*/acquire", {"tools": ["tip"]}, "unknown_action"),
+        ("nobody/*", {}, "unknown_action"),
+        ("nobody/explode", {}, "unknown_action"),
+        ("nobody/acquire", {"tools": "tip"}, "wrong_type"),
+        ("nobody/acquire", {}, "missing_field"),
+        ("nobody/acquire", {"tools": ["tip"], "frame": {"scale": 0}}, "out_of_range"),
+        ("nobody/acquire", {"tools": ["tip"], "round_trip_s": -1}, "out_of_range"),
         ("nobody/limits", {}, "missing_field"),
         ("nobody/limits", {"limits": {"max_force_n": 1.0}}, "not_holder"),
-        ("nobody/acquire", [1], "not_a_map"),
-        ("nobody/acquire", {"contacts": ["tip"], "device": ["omega"]}, "unknown_device"),
-        ("nobody/acquire", {"contacts": ["tip"], "device": {}}, "unknown_device"),
-        ("nobody/explode", None, "unknown_action"),
+        ("nobody/acquire", {"tools": ["tip"], "device": ["omega"]}, "unknown_device"),
+        ("nobody/acquire", {"tools": ["tip"], "device": {}}, "unknown_device"),
+        ("nobody/record", {"file": "a.mcap"}, "no_recordings"),
     ],
 )
 def test_every_refusal_carries_its_reason(
-    shared_server: Any, connect: Callable[..., Any], key: str, request_: object, reason: str
+    shared_server: Any, connect: Callable[..., Any], key: str, fields: dict[str, Any], reason: str
 ) -> None:
     with connect(shared_server.endpoint) as client:
-        granted, refusal = client.query(f"control/{key}", request_)
+        request = {"kind": "request", "schema_version": 2, **fields}
+        granted, refusal = client.query(f"control/{key}", request)
         assert not granted
-        assert refusal["reason"] == reason
+        assert (refusal["kind"], refusal["reason"]) == ("refusal", reason)
         assert refusal["message"]
+
+
+@pytest.mark.parametrize(
+    ("request_", "reason"),
+    [
+        (None, "wrong_version"),
+        ({"contacts": ["tip"]}, "wrong_version"),
+        ({"schema_version": 2, "tools": ["tip"]}, "wrong_kind"),
+        ([1], "not_a_map"),
+    ],
+)
+def test_a_request_of_another_version_or_kind_is_refused(
+    shared_server: Any, connect: Callable[..., Any], request_: object, reason: str
+) -> None:
+    with connect(shared_server.endpoint) as client:
+        granted, refusal = client.query("control/nobody/acquire", request_)
+        assert (granted, refusal["reason"]) == (False, reason)
+
+
+def test_a_delete_on_a_command_key_is_counted_as_malformed(
+    serve: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve()
+    with connect(served.endpoint) as client:
+        client.session.delete(client.key(f"command/{client.name}"))
+        client.status_when(lambda status: status["malformed"]["not_msgpack"] == 1, "the DELETE")
+
+
+def test_a_query_with_any_key_is_answered_and_does_not_fill_the_log(
+    serve: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    served = serve()
+    with connect(served.endpoint) as client:
+        for _ in range(100):
+            for key in ("palpate/**", "**", "palpate/test/control/*/*", "palpate/*/describe"):
+                replies = list(client.session.get(key, timeout=60.0))
+                answers = [reply.ok or reply.err for reply in replies]
+                assert answers
+                assert all(str(answer.encoding).startswith("application/msgpack") for answer in answers)
+        assert client.acquire("tip")[0]
+    assert served.stop() == 0
+    assert "Traceback" not in served.program.printed()
+    assert len(served.program.printed().splitlines()) < 20
 
 
 def test_a_device_brings_its_limits_its_frame_and_warnings(
@@ -304,20 +345,21 @@ def test_a_device_brings_its_limits_its_frame_and_warnings(
 ) -> None:
     served = serve()
     with connect(served.endpoint) as client:
-        request = {"contacts": ["tip"], "device": "touch"}
+        request: dict[str, Any] = {"tools": ["tip"], "device": "touch"}
         request |= {"round_trip_s": 2e-3, "device_damping_n_s_per_m": 0.01, "frame": {"scale": 2.0}}
-        granted, terms = client.control("acquire", request)
+        granted, terms = client.control("acquire", **request)
         assert granted
-        assert terms["limits"]["max_force_n"] == 3.3
+        limits = terms["tools"]["tip"]["limits"]
+        assert limits["max_force_n"] == 3.3
         assert terms["frame"]["scale"] == 2.0
         assert any("damping" in warning for warning in terms["warnings"])
-        status = client.next_status()["contacts"]["tip"]
+        status = client.next_status()["tools"]["tip"]
         assert status["holder"] == client.name
-        assert status["limits"] == terms["limits"]
+        assert status["limits"] == limits
         assert status["frame"]["scale"] == 2.0
 
         save_model(spring_mass_model(1, 35), tmp_path / "stiffer.npz")
-        granted, answer = client.control("load", {"model": "stiffer.npz"})
+        granted, answer = client.control("load", file="stiffer.npz")
         assert granted
         damping, stiffer = (next(w for w in of["warnings"] if "damping" in w) for of in (terms, answer))
         needed, needed_by_stiffer = (
@@ -325,18 +367,16 @@ def test_a_device_brings_its_limits_its_frame_and_warnings(
         )
         assert needed_by_stiffer > needed
 
-        granted, refusal = client.control("acquire", request | {"device": "hammer"})
+        granted, refusal = client.control("acquire", **request | {"device": "hammer"})
         assert (granted, refusal["reason"]) == (False, "unknown_device")
-        granted, refusal = client.control("acquire", request | {"frame": {"scale": -1}})
+        granted, refusal = client.control("acquire", **request | {"frame": {"scale": -1}})
         assert (granted, refusal["reason"]) == (False, "out_of_range")
-        nothing = {"limits": {"max_damping_n_s_per_m": None}}
-        granted, refusal = client.control("limits", nothing)
+        granted, refusal = client.control("limits", limits={"max_damping_n_s_per_m": None})
         assert (granted, refusal["reason"]) == (False, "wrong_type")
 
-        limits = {"limits": {"max_force_n": 1.5}}
-        granted, answer = client.control("limits", limits)
+        granted, answer = client.control("limits", limits={"max_force_n": 1.5})
         assert granted
-        assert answer["limits"] == {"tip": terms["limits"] | {"max_force_n": 1.5}}
+        assert answer["tools"] == {"tip": {"limits": limits | {"max_force_n": 1.5}}}
         beyond: list[dict[str, float]] = [  # of the server's 10 N, or of the device's 3.3 N and 5 N s/m
             {"max_force_n": 11.0},
             {"max_force_n": 3.4},
@@ -346,19 +386,18 @@ def test_a_device_brings_its_limits_its_frame_and_warnings(
             {"max_force_n": math.inf},
         ]
         for wanted in beyond:
-            granted, refusal = client.control("limits", {"limits": wanted})
+            granted, refusal = client.control("limits", limits=wanted)
             assert (granted, refusal["reason"]) == (False, "out_of_range")
         for too_slow in (199.0, 1e-320):  # the server's 10 N in the 50 ms of the fading are 200 N/s
-            slow = limits | {"limits": {"max_force_rate_n_per_s": too_slow}}
-            granted, refusal = client.control("limits", slow)
+            granted, refusal = client.control("limits", limits={"max_force_rate_n_per_s": too_slow})
             assert (granted, refusal["reason"]) == (False, "out_of_range")
             assert "200" in refusal["message"]
-        assert client.control("limits", limits | {"limits": {"max_force_rate_n_per_s": 200.0}})[0]
-        granted, refusal = client.control("limits", limits | {"limits": {"max_torque": 1.0}})
+        assert client.control("limits", limits={"max_force_rate_n_per_s": 200.0})[0]
+        granted, refusal = client.control("limits", limits={"max_torque": 1.0})
         assert (granted, refusal["reason"]) == (False, "unknown_limit")
 
 
-def test_a_client_that_goes_on_commanding_may_acquire_its_contact_again(
+def test_a_client_that_goes_on_commanding_may_acquire_its_tool_again(
     serve: Callable[..., Any], connect: Callable[..., Any]
 ) -> None:
     served = serve(n_contacts=2)
@@ -369,8 +408,8 @@ def test_a_client_that_goes_on_commanding_may_acquire_its_contact_again(
             granted, answer = client.acquire("tip1", "tip")
             assert granted, answer
             client.force_when(in_full, "the force in full again")
-        contacts = client.next_status()["contacts"]
-        assert [contacts[name]["holder"] for name in ("tip", "tip1")] == [client.name] * 2
+        tools = client.next_status()["tools"]
+        assert [tools[name]["holder"] for name in ("tip", "tip1")] == [client.name] * 2
 
 
 def test_only_who_is_alone_may_reset_the_model(
@@ -415,19 +454,20 @@ def test_a_model_is_exchanged_while_a_client_presses_and_a_bad_file_leaves_the_o
                 "",
                 3,
             ):
-                granted, refusal = client.control("load", {"model": name})
+                granted, refusal = client.control("load", file=name)
                 assert (granted, refusal["reason"]) == (False, "bad_model")
             assert client.query("describe")[1]["model"]["name"] == "masses on springs"
             for _ in range(5):  # on a busy machine ticks may be skipped, but not each time
                 before = client.next_status()
-                answer = {"model": "other", "order": 70, "warnings": []}
-                assert client.control("load", {"model": "other.npz"}) == (True, answer)
+                granted, answer = client.control("load", file="other.npz")
+                assert granted
+                assert (answer["model"]["name"], answer["model"]["order"]) == ("other", 70)
                 after = client.status_when(
                     lambda status: status["model"]["name"] == "other", "the other model"
                 )
                 if after["skipped_ticks"] == before["skipped_ticks"]:
                     break
-                assert client.control("load", {"model": "model1.npz"})[0]
+                assert client.control("load", file="model1.npz")[0]
             else:
                 raise AssertionError("ticks were skipped in each of 5 exchanges")
             client.force_when(lambda force: force["tick"] > after["ticks"], "the forces until now")
@@ -451,10 +491,10 @@ def test_describe_and_geometry_say_what_the_model_is(
     surface = served.model.surface
     with connect(served.endpoint) as client:
         _, description = client.query("describe")
-        assert description["schema_version"] == 1
+        assert description["schema_version"] == 2
         assert description["limits"]["max_force_n"] == 3.5
         assert description["surface_period_s"] == 1 / 60
-        assert [contact["name"] for contact in description["contacts"]] == ["tip"]
+        assert [tool["name"] for tool in description["tools"]] == ["tip"]
         assert description["model"]["accuracy"]["band_hz"] == [0.0, 30.0]
         _, geometry = client.query("geometry")
         vertices = np.frombuffer(geometry["vertices_m"], "<f4").reshape(-1, 3)
@@ -472,7 +512,7 @@ def test_describe_and_geometry_say_what_the_model_is(
 
         wait_for(intervals, "some surfaces, two of them in time", lambda seen: len(seen) >= 4 and 17 in seen)
         subscriber.undeclare()
-        moved = np.frombuffer(surfaces[-1]["displacement_m"], "<f4")
+        moved = np.frombuffer(surfaces[-1]["position_m"], "<f4")
         np.testing.assert_array_equal(
             moved, np.zeros(3 * len(surface.vertices), np.float32)
         )  # nobody pokes it
@@ -509,25 +549,113 @@ def test_the_threads_that_run_ticks_are_kept_on_the_processor_that_is_asked_for(
     assert "not kept on processor 1000" in served.program.printed()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_the_server_cleanly_within_a_second(
     serve: Callable[..., Any], connect: Callable[..., Any], wait_for: Callable[..., Any], number: int
 ) -> None:
-    def seconds_to_stop() -> float:
-        served = serve()
-        with connect(served.endpoint) as client:
-            gone: list[object] = []
-            client.session.liveliness().declare_subscriber("palpate/test/server", gone.append)
-            assert client.acquire("tip")[0]
-            asked = time.monotonic()
-            assert served.stop(number) == 0
-            elapsed_s = time.monotonic() - asked
-            wait_for(lambda: gone, "the end of the server's token")
-            wait_for(lambda: client.statuses[-1]["state"], "a last status", lambda state: state == "stopping")
-            return elapsed_s
+    served = serve()
+    with connect(served.endpoint) as client:
+        gone: list[int] = []
+        client.session.liveliness().declare_subscriber(
+            "palpate/test/server", lambda sample: gone.append(time.monotonic_ns())
+        )
+        assert client.acquire("tip")[0]
+        assert served.stop(number) == 0
+        wait_for(lambda: gone, "the end of the server's token")
+        stopping = [status for status in client.statuses if status["state"] == "stopping"]
+        assert stopping
+        # From when it said so, which is as soon as the signal is served, to when its token went.
+        assert gone[-1] - stopping[0]["server_time_ns"] < 1e9
 
-    # A busy machine may take longer, but not each time.
-    assert any(seconds_to_stop() < 1.0 for _ in range(5))
+
+def test_a_hang_up_that_is_ignored_does_not_stop_the_server(
+    start: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+) -> None:
+    save_model(spring_mass_model(), tmp_path / "model.npz")
+    endpoint = free_endpoint()
+    script = (
+        "import signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN);"
+        "from palpate_server.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    )
+    options = ("--listen", endpoint, "--session", "test")
+    server = start("-c", script, tmp_path / "model.npz", *options, ready="serving")
+    with connect(endpoint) as client:
+        server.process.send_signal(signal.SIGHUP)
+        client.next_status()
+        assert client.next_status()["state"] == "running"
+    assert server.stop() == 0
+
+
+HEAVY = ("scipy", "trimesh", "pydantic", "pydantic_core", "rich")
+
+
+def imported(report: str) -> set[str]:
+    """The modules in what `python -X importtime` has printed."""
+    return set(re.findall(r"^import time: .*\|\s*(\S+)$", report, re.MULTILINE))
+
+
+def test_the_server_process_imports_nothing_that_only_a_build_needs(
+    start: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+) -> None:
+    """Beyond what numba itself looks for."""
+    save_model(spring_mass_model(), tmp_path / "model.npz")
+    endpoint = free_endpoint()
+    numba = start("-X", "importtime", "-c", "import numba")
+    options = ("--listen", endpoint, "--session", "test")
+    server = start(
+        "-X", "importtime", "-m", "palpate_server", tmp_path / "model.npz", *options, ready="serving"
+    )
+    with connect(endpoint) as client:
+        assert client.acquire("tip")[0]
+        assert client.control("load", file="model.npz")[0]
+    assert server.stop() == 0
+    more = imported(server.err.read_text()) - imported(numba.finish()[2])
+    assert "palpate_server.session.server" in more
+    assert not {name for name in more if name.split(".")[0] in HEAVY}
+
+
+def test_a_model_that_is_wrong_by_its_own_report_is_told_of_at_the_start(
+    start: Callable[..., Any], tmp_path: Path
+) -> None:
+    model = spring_mass_model()
+    accuracy = replace(model.accuracy, error_in_band=1.43)
+    save_model(replace(model, accuracy=accuracy), tmp_path / "wrong.npz")
+    server = start(
+        "-m", "palpate_server", tmp_path / "wrong.npz", "--listen", free_endpoint(), ready="serving"
+    )
+    assert "143 %" in server.err.read_text()
+    assert server.stop() == 0
+
+
+def test_a_model_file_that_unpacks_to_a_gibibyte_costs_no_force_and_no_lease(
+    serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serve()
+    model = tmp_path / "model1.npz"
+    with (
+        zipfile.ZipFile(model) as good,
+        zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as bomb,
+    ):
+        for name in good.namelist():
+            if name != "metadata.npy":
+                bomb.writestr(name, good.read(name))
+        with bomb.open("metadata.npy", "w", force_zip64=True) as member:
+            header = {"descr": "|u1", "fortran_order": False, "shape": (2**30,)}
+            np.lib.format.write_array_header_1_0(member, header)
+            for _ in range(2**10):
+                member.write(bytes(2**20))
+    with connect(served.endpoint) as client:
+        assert client.acquire("tip")[0]
+        with client.pressing({"tip": [0.0, 0.0, -0.004]}):
+            client.force_when(in_full, "the force in full")
+            before = client.next_status()
+            granted, refusal = client.control("load", file="bomb.npz")
+            after = client.next_status()
+        assert (granted, refusal["reason"]) == (False, "bad_model")
+        assert after["tools"]["tip"]["holder"] == client.name
+        for counter in ("lost_clients", "skipped_ticks"):
+            assert after[counter] == before[counter]
+        assert after["dropped"]["unsent_force"] == before["dropped"]["unsent_force"]
 
 
 def test_a_server_that_cannot_start_says_why_in_one_line(
@@ -585,33 +713,34 @@ def test_metrics_of_a_running_server_are_served_to_prometheus(
 
     text = wait_for(scrape, "the server", lambda text: "palpate_up 1.0" in text)
     assert 'palpate_malformed_total{reason="not_msgpack"} 0.0' in text
-    assert 'palpate_success_rate{contact="tip"} 0.0' in text
+    assert 'palpate_success_rate{tool="tip"} 0.0' in text
     assert float(re.findall(r"^palpate_ticks_total (\S+)", text, re.MULTILINE)[0]) > 0
     served.stop()
     wait_for(scrape, "the end of the server", lambda text: "palpate_up 0.0" in text)
 
 
 def test_a_client_that_never_stops_asking_does_not_keep_the_server_from_stopping(
-    serve: Callable[..., Any], connect: Callable[..., Any]
+    serve: Callable[..., Any], connect: Callable[..., Any], wait_for: Callable[..., Any]
 ) -> None:
     served = serve()
     with connect(served.endpoint) as client:
         assert client.acquire("tip")[0]
         done = threading.Event()
+        answered: list[object] = []
+        payload = msgpack.packb({"kind": "request", "schema_version": 2, "limits": {"max_force_n": 1.0}})
 
         def ask() -> None:
             while not done.is_set():
-                payload = msgpack.packb({"limits": {"max_force_n": 1.0}})
-                for _ in client.session.get(
+                for _reply in client.session.get(
                     f"palpate/test/control/{client.name}/limits", payload=payload, timeout=0.5
                 ):
-                    pass
+                    answered.append(None)
 
         threads = [threading.Thread(target=ask) for _ in range(3)]
         for thread in threads:
             thread.start()
         try:
-            time.sleep(0.3)
+            wait_for(lambda: len(answered) > 100, "some answers")
             assert served.stop() == 0
         finally:
             done.set()
