@@ -512,7 +512,7 @@ def test_describe_and_geometry_say_what_the_model_is(
 
         wait_for(intervals, "some surfaces, two of them in time", lambda seen: len(seen) >= 4 and 17 in seen)
         subscriber.undeclare()
-        moved = np.frombuffer(surfaces[-1]["position_m"], "<f4")
+        moved = np.frombuffer(surfaces[-1]["displacement_m"], "<f4")
         np.testing.assert_array_equal(
             moved, np.zeros(3 * len(surface.vertices), np.float32)
         )  # nobody pokes it
@@ -597,10 +597,10 @@ def imported(report: str) -> set[str]:
 def test_the_server_process_imports_nothing_that_only_a_build_needs(
     start: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """Beyond what numba itself looks for."""
+    """Beyond numba itself, which looks for scipy's BLAS when it compiles and goes on where there is no scipy."""
     save_model(spring_mass_model(), tmp_path / "model.npz")
     endpoint = free_endpoint()
-    numba = start("-X", "importtime", "-c", "import numba")
+    numba = start("-X", "importtime", "-c", "import numba; numba.njit(lambda x: x + 1)(1)")
     options = ("--listen", endpoint, "--session", "test")
     server = start(
         "-X", "importtime", "-m", "palpate_server", tmp_path / "model.npz", *options, ready="serving"
