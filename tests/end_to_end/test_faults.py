@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 
+from palpate_client.local_server import free_endpoint
 from palpate_client.wire import Flags, pack
-from palpate_server.diagnostics.round_trips import free_endpoint
 
 # Of the server below. A press of DEPTH_M (50 N/m when it has settled, more before) goes beyond the largest force, and
 # one tick may change it by a fiftieth of that: the lowest rate that is accepted, so a step beyond it has room to show.

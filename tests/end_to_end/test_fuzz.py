@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import time
 from collections.abc import Callable, Iterator
@@ -81,13 +82,16 @@ def served(serve_for_module: Callable[..., Any]) -> Any:
 
 @pytest.fixture
 def client(served: Any, connect: Callable[..., Any]) -> Iterator[Any]:
-    """It holds the tool. Afterwards the server is as before: it answers, has skipped no tick and had no fault."""
+    """Afterwards the server is as before: it answers, has had no fault, and has skipped no tick that others did not cost it."""
     with connect(served.endpoint) as client:
         before = client.next_status()
         yield client
         after = client.next_status()
         assert after["faults"] == before["faults"]
-        if "no real-time scheduling" not in served.program.printed():  # it got the priority that it asked for
+        quiet = os.getloadavg()[0] <= (
+            os.cpu_count() or 1
+        )  # else the ticks that are skipped are the others' doing
+        if quiet and "no real-time scheduling" not in served.program.printed():
             assert after["skipped_ticks"] == before["skipped_ticks"]
         assert client.acquire("tip")[0]
         sequence = client.command({"tip": [0.0, 0.0, 0.0]}, sequence=2**63 - 1)

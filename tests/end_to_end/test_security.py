@@ -17,8 +17,8 @@ import zenoh
 from mcap.reader import make_reader
 
 from palpate.model_file import save_model
+from palpate_client.local_server import free_endpoint
 from palpate_client.wire import Keys, pack
-from palpate_server.diagnostics.round_trips import free_endpoint
 from palpate_server.diagnostics.sample_model import spring_mass_model
 
 EXAMPLE = Path(__file__).parents[2] / "configs" / "security"

@@ -26,8 +26,8 @@ import numpy as np
 import pytest
 
 from palpate.model_file import save_model
+from palpate_client.local_server import free_endpoint
 from palpate_client.wire import Flags
-from palpate_server.diagnostics.round_trips import free_endpoint
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.recording.replay import read_session
 

@@ -1,4 +1,4 @@
-"""What common haptic devices can bear, and whether a model is too stiff for one."""
+"""Bounds of common haptic devices, and warnings when a model is too stiff for one."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ class DeviceProfile:
 
 @dataclass(frozen=True)
 class Device:
-    """What a client said of the device that renders for it: its kind, and, when it knows them, its own command-to-force
-    round trip and its own mechanical damping."""
+    """The device that a client renders with; its round trip from command to force and its own damping, when told."""
 
     profile: DeviceProfile
     round_trip_s: float | None = None
@@ -62,9 +61,9 @@ def limits_for(profile: DeviceProfile, ceiling: Limits) -> Limits:
     )
 
 
-def warnings_for(device: Device, model: ReducedModel, contact: int, scale: float) -> list[str]:
-    """What whoever renders a contact (by index) of `model` with `device` should know; `scale` is their frame's."""
-    rows = slice(3 * contact, 3 * contact + 3)
+def warnings_for(device: Device, model: ReducedModel, tool: int, scale: float) -> list[str]:
+    """Why `device` may not render a tool (by index) of `model` stably; `scale` is that of the client's frame."""
+    rows = slice(3 * tool, 3 * tool + 3)
     stiffness = float(np.linalg.norm(model.continuous.d[rows, rows], 2)) * scale**2
     warnings = stiffness_warnings(
         device.profile, stiffness, model.period_s, device.round_trip_s, device.damping_n_s_per_m
@@ -87,8 +86,8 @@ def stiffness_warnings(
 ) -> list[str]:
     """Why a stiffness (the model's instant one, at the device) may not be rendered stably; empty when nothing is wrong.
 
-    Colgate & Schenkel (1997): a sampled spring K is passive on a device with damping b when b > K T / 2 (the model adds
-    no damping of its own here). A delay of the force counts like so much more of the sampling time.
+    Colgate & Schenkel (1997): a sampled spring K is passive on a device with damping b if b > K T / 2, for a model
+    without damping of its own. A delay D of the force adds to the half period: b > K (T / 2 + D).
     """
     warnings = []
     if stiffness_n_per_m > profile.max_stiffness_n_per_m:
