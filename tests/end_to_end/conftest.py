@@ -26,6 +26,7 @@ import zenoh
 
 from palpate.model_file import ReducedModel, save_model
 from palpate_client.local_server import free_endpoint
+from palpate_client.wire import KEEP_ALIVES, LEASE_MS
 from palpate_server.diagnostics.sample_model import spring_mass_model
 
 EXAMPLES = Path(__file__).parents[2] / "client_examples"
@@ -367,6 +368,8 @@ def _configuration(place: str | Path) -> zenoh.Config:
         "connect/endpoints": [place],
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/keep_alive": KEEP_ALIVES,
     }.items():
         config.insert_json5(key, json.dumps(value))
     return config
