@@ -74,6 +74,6 @@ def _text(cell: Cell) -> str:
 
 
 def tidy(axis: Any) -> None:
-    """The house style of a panel: light grid, two spines."""
+    """The style of every panel: light grid, two spines."""
     axis.grid(alpha=0.25, which="both")
     axis.spines[["top", "right"]].set_visible(False)

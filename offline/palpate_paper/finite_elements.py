@@ -1,4 +1,4 @@
-"""Finite elements as the referee: membranes and the cube by scikit-fem, linear as in the paper or quadratic.
+"""Finite elements as a reference: membranes and the cube by scikit-fem, linear as in the paper or quadratic.
 
 BaniHani & De 2009, section 4, compares with linear triangles and tetrahedra; the quadratic elements here are the finer
 reference. scikit-fem is needed for this module only.

@@ -1,4 +1,4 @@
-"""The finite-element referees against exact frequencies; the meshfree models beside them."""
+"""Finite elements against exact frequencies, and the meshfree models against finite elements."""
 
 import importlib.util
 import sys
