@@ -93,6 +93,7 @@ def test_no_client_loses_the_server_beside_busy_loops(start: Callable[..., Any],
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_no_client_loses_the_server_in_ten_runs_beside_busy_loops(
     start: Callable[..., Any], tmp_path: Path
 ) -> None:
