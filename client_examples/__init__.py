@@ -1,1 +1,0 @@
-"""Small programs that a user copies: each runs as a script and needs only eclipse-zenoh and msgpack."""
