@@ -1,18 +1,32 @@
-# Stage 1 builds the wheel and installs it, with the pinned versions, into a virtual environment.
-FROM python:3.11-slim AS build
+# Stage 1: the wheel, and a virtual environment with the pinned versions of what a server needs.
+FROM python:3.11-slim AS wheel
 WORKDIR /src
 COPY pyproject.toml README.md LICENSE constraints.txt ./
 COPY offline offline
 COPY server server
+COPY client client
 COPY client_examples client_examples
 COPY configs configs
-RUN python -m venv /opt/palpate \
-    && /opt/palpate/bin/pip install --no-cache-dir --constraint constraints.txt ".[recorder,metrics]"
+RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheel . \
+    && python -m venv /opt/palpate \
+    && /opt/palpate/bin/pip install --no-cache-dir --constraint constraints.txt "$(ls /wheel/*.whl)[recorder,metrics]"
 
-# Stage 2 runs it: no compiler, no sources, not root.
-FROM python:3.11-slim
+# `docker build --target build -t palpate-build .`: builds models. Mount a folder with scenes at /models, for example
+# `docker run --rm --user "$(id -u)" -v "$PWD:/models" palpate-build build configs/liver.toml -o liver.npz`.
+FROM wheel AS build
+RUN /opt/palpate/bin/pip install --no-cache-dir --constraint constraints.txt "$(ls /wheel/*.whl)[build]"
+ENV PATH=/opt/palpate/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    NUMBA_CACHE_DIR=/tmp/numba
+USER 10001
+WORKDIR /models
+ENTRYPOINT ["palpate"]
+CMD ["build", "--help"]
+
+# The default target serves: no compiler, no sources, not root, and none of the libraries that build models.
+FROM python:3.11-slim AS serve
 RUN useradd --create-home --uid 10001 palpate
-COPY --from=build /opt/palpate /opt/palpate
+COPY --from=wheel /opt/palpate /opt/palpate
 ENV PATH=/opt/palpate/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     NUMBA_CACHE_DIR=/home/palpate/.cache/numba \
@@ -20,7 +34,7 @@ ENV PATH=/opt/palpate/bin:$PATH \
 USER 10001
 WORKDIR /models
 # The kernels are compiled here, as the user that will run them: the server then starts in about a second.
-RUN python -c "from palpate_server.session.server import warm_up; warm_up(0.001, 1)"
+RUN python -c "from palpate_server.session.warm_up import warm_up; warm_up(0.001, 1)"
 EXPOSE 7447
 STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=10s --timeout=5s --start-period=10s --retries=3 \

@@ -18,7 +18,7 @@ PACKAGES = {
 }
 
 ALLOWED = {
-    "palpate_client": (),
+    "palpate_client": ("palpate.files",),
     "palpate_server": ("palpate_client.wire", "palpate.model_file", "palpate.files"),
     "palpate": (),
     "palpate_paper": ("palpate",),

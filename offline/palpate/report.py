@@ -1,14 +1,15 @@
-"""The accuracy report of a model as a table for a person."""
+"""The accuracy report of a model in words that need no knowledge of the method; every figure on request."""
 
 from __future__ import annotations
 
 import numpy as np
-from rich import box
-from rich.table import Table
 
-from palpate.model_file import ReducedModel
+from palpate.model_file import Contact, ReducedModel
 
-_NOTABLE = 0.1  # a relative error above this is not what a model is built for
+GOOD_ERROR = 0.05  # below what a hand tells apart: from about 7 % of a force (Pang, Tan & Durlach 1991)
+NOTABLE_ERROR = 0.1  # above this a model is not what it was built for
+
+Rows = list[tuple[str, str, str]]
 
 
 def percent(fraction: float) -> str:
@@ -16,70 +17,111 @@ def percent(fraction: float) -> str:
     return f"{100 * fraction:.2g} %" if fraction < 0.995 else f"{100 * fraction:.0f} %"
 
 
-def marked(fraction: float) -> str:
-    """The same, in yellow where nobody should overlook it."""
-    return f"[yellow]{percent(fraction)}[/]" if fraction > _NOTABLE else percent(fraction)
+def accuracy_text(model: ReducedModel, verbose: bool = False) -> str:
+    """What a person should know before using the model, then a verdict and what to do; `verbose` adds every figure."""
+    lines = [f"\n{model.name}: {model.order} states instead of {model.n_states_full:,} ({model.method})"]
+    lines += _columns(_first_screen(model))
+    lines.append(f"  verdict: {_verdict(model)}")
+    lines += [f"  - {text}" for text in advice(model)]
+    if verbose:
+        lines += ["", "every figure (docs/model-file.md defines them):", *_columns(_figures(model))]
+    else:
+        lines.append("  (--verbose shows every figure)")
+    return "\n".join(lines)
 
 
-def accuracy_table(model: ReducedModel) -> Table:
-    """What the model is and how good it is, a line each."""
-    accuracy = model.accuracy
-    table = Table(
-        title=f"{model.name}: {model.method}, order {model.order}",
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-    )
-    table.add_column("accuracy", no_wrap=True)
-    table.add_column("value", justify="right", no_wrap=True)
-    table.add_column("meaning", style="dim")
-
-    low, high = accuracy.band_hz
-    bound = "none" if accuracy.error_bound is None else percent(accuracy.error_bound)
-    table.add_row(
-        "states",
-        f"{model.n_states_full:,} → {model.order}",
-        f"{model.n_nodes:,} nodes",
-    )
-    table.add_row("error in band", marked(accuracy.error_in_band), f"force, largest in {low:g}-{high:g} Hz")
-    table.add_row("before sampling", marked(accuracy.error_in_band_continuous), "the reduction's share of it")
-    table.add_row("error at 0 Hz", marked(accuracy.error_static), "static force")
-    table.add_row("error, H-infinity", percent(accuracy.error_hinf), "of the largest response")
-    table.add_row("bound, H-infinity", bound, "a priori")
-    table.add_row("error in time", marked(accuracy.error_time_domain), "force during a poke")
-    table.add_row("error after a jump", marked(accuracy.error_step), "of the static force, 0.2 s later")
-    table.add_row("error of the surface", marked(accuracy.error_surface_in_band), "displacement in the band")
-    table.add_row(
-        "spectral abscissa",
-        f"{accuracy.spectral_abscissa:.3g}",
-        "1/s; below 0: stable",
-    )
-    table.add_row(
-        "passivity margin",
-        f"{accuracy.passivity_margin:.2g}",
-        "below 0: can give out energy",
-    )
-    table.add_row(
-        "passive up to", f"{accuracy.passive_up_to_hz:.3g} Hz", "only faster pokes can get energy out"
-    )
-    table.add_row(
-        "energy given out",
-        f"{accuracy.largest_energy_out_j:.2g} J",
-        "at most, by a closed poke of 1 mm",
-    )
-    resolved = accuracy.resolved_frequency_hz
-    meaning = "shear waves, 6 nodes each"
-    if resolved < high:
-        meaning += f"; [yellow]band: {high:g} Hz[/]"
-    table.add_row("cloud resolves", f"{resolved:.3g} Hz", meaning)
-    for index, contact in enumerate(model.contacts):
-        along = slice(3 * index, 3 * index + 3)
-        normal = np.asarray(contact.normal)
-        rest = normal @ model.static_stiffness[along, along] @ normal
-        instant = normal @ model.continuous.d[along, along] @ normal
-        table.add_row(
-            f"stiffness at '{contact.name}'",
-            f"{rest:.3g} N/m",
-            f"at rest; instantly {instant:.3g}",
+def advice(model: ReducedModel) -> list[str]:
+    """What to change, a sentence each, where an error is notable; empty for a good model. Never what is in use."""
+    accuracy, found = model.accuracy, []
+    if max(accuracy.error_in_band, accuracy.error_static) > NOTABLE_ERROR:
+        other = "" if model.method == "tbr-band" else " or use tbr-band"
+        found.append(f"Force: raise the order{other}. A model that always answers zero is wrong by 100 %.")
+    if accuracy.error_step > max(NOTABLE_ERROR, 2 * accuracy.error_static):
+        found.append(
+            "After a jump: the body rings near half the sampling rate; give the material a branch of short tau_s."
         )
-    return table
+    if model.continuous.n_padding:
+        found.append(f"Order {model.order - 1} is stored as {model.order}: states come in pairs, one is padding.")
+    if accuracy.resolved_frequency_hz < accuracy.band_hz[1]:
+        factor = accuracy.resolved_frequency_hz / accuracy.band_hz[1]
+        found.append(
+            f"Mesh: to carry the whole band, make the node spacing {factor:.2g} times what it is, or end the band at "
+            f"{accuracy.resolved_frequency_hz:.3g} Hz."
+        )
+    return found
+
+
+def _first_screen(model: ReducedModel) -> Rows:
+    accuracy = model.accuracy
+    low, high = accuracy.band_hz
+    carried = accuracy.resolved_frequency_hz
+    rows = [
+        ("force while moving", f"wrong by at most {percent(accuracy.error_in_band)}", f"motions of {low:g} to {high:g} Hz, the haptic band"),
+        ("force at rest", f"wrong by {percent(accuracy.error_static)}", "tip held still"),
+        ("force after a jump", f"wrong by {percent(accuracy.error_step)}", "of the force at rest, from 0.2 s on"),
+        ("mesh", f"carries waves up to {carried:.3g} Hz", "the whole band" if carried >= high else "not the whole band: above it, the force is the mesh's more than the tissue's"),
+    ]  # fmt: skip
+    if accuracy.passive_up_to_hz >= 0.499 / model.period_s:
+        rows.append(("energy", "never given out", "passive at every frequency"))
+    else:
+        most = 1e3 * accuracy.largest_energy_out_j
+        rows.append(
+            ("energy", f"passive up to {accuracy.passive_up_to_hz:.3g} Hz", f"faster motions of 1 mm can get {most:.2g} mJ out, each")
+        )  # fmt: skip
+    for index, contact in enumerate(model.contacts):
+        rest, instant = _stiffness(model, index, contact)
+        rows.append(
+            (
+                f"stiffness at '{contact.name}'",
+                f"{rest:.3g} N/m at rest",
+                f"{instant:.3g} N/m at the first instant",
+            )
+        )
+    return rows
+
+
+def _verdict(model: ReducedModel) -> str:
+    accuracy = model.accuracy
+    worst = max(accuracy.error_in_band, accuracy.error_static, accuracy.error_step)
+    if worst > NOTABLE_ERROR:
+        return f"poor: the force is wrong by up to {percent(worst)} of itself"
+    resolved = accuracy.resolved_frequency_hz >= accuracy.band_hz[1]
+    mesh = "" if resolved else f"; the mesh limits it above {accuracy.resolved_frequency_hz:.3g} Hz"
+    if worst > GOOD_ERROR:
+        return f"fair: a trained hand may feel the error{mesh}"
+    return f"good: the error of the reduction is below what a hand tells apart{mesh}"
+
+
+def _stiffness(model: ReducedModel, index: int, contact: Contact) -> tuple[float, float]:
+    """N/m along the contact's normal, at rest and at the first instant."""
+    along, normal = slice(3 * index, 3 * index + 3), np.asarray(contact.normal)
+    rest, instant = (
+        float(normal @ matrix[along, along] @ normal)
+        for matrix in (model.static_stiffness, model.continuous.d)
+    )
+    return rest, instant
+
+
+def _figures(model: ReducedModel) -> Rows:
+    accuracy = model.accuracy
+    bound = "none" if accuracy.error_bound is None else percent(accuracy.error_bound)
+    return [
+        ("nodes", f"{model.n_nodes:,}", ""),
+        ("error in band", percent(accuracy.error_in_band), "force, the discrete model against the full one"),
+        ("before sampling", percent(accuracy.error_in_band_continuous), "the reduction's share of it"),
+        ("error at 0 Hz", percent(accuracy.error_static), "static force"),
+        ("error in time", percent(accuracy.error_time_domain), "force during a poke, of the largest force"),
+        ("error of the surface", percent(accuracy.error_surface_in_band), "displacement, largest in the band"),
+        ("error, H-infinity", percent(accuracy.error_hinf), "largest over all frequencies, of the largest response; far above the band it may be 100 %"),
+        ("bound, H-infinity", bound, "what the method guarantees beforehand"),
+        ("spectral abscissa", f"{accuracy.spectral_abscissa:.3g} 1/s", "of the slowest state; below 0 is stable"),
+        ("passivity margin", f"{accuracy.passivity_margin:.2g}", "dissipation over static stiffness, smallest; below 0 can give out energy"),
+        ("passive up to", f"{accuracy.passive_up_to_hz:.3g} Hz", "no slower sinusoidal motion gets energy out"),
+        ("energy given out", f"{accuracy.largest_energy_out_j:.2g} J", "at most, in one closed motion of 1 mm"),
+        ("mesh resolves", f"{accuracy.resolved_frequency_hz:.3g} Hz", "shear waves with 6 nodes each"),
+    ]  # fmt: skip
+
+
+def _columns(rows: Rows) -> list[str]:
+    first, second = (max(len(row[column]) for row in rows) for column in (0, 1))
+    return [f"  {a:<{first}}  {b:<{second}}  {c}".rstrip() for a, b, c in rows]

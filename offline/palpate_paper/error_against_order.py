@@ -20,6 +20,7 @@ from palpate.lti.frequencies import all_frequencies, band_frequencies, spectral_
 from palpate.plots import require_matplotlib
 from palpate.reduction.methods import METHODS, reductions
 from palpate.scene.schema import load_config
+from palpate.stages import stage_reporter
 
 ORDERS = (20, 40, 60, 80, 100, 120, 160, 200)
 

@@ -21,21 +21,6 @@ def assert_is_refused(program: Any, words: str) -> None:
     assert words in err
 
 
-@pytest.mark.parametrize(
-    ("module", "package", "extra"),
-    [
-        ("record", "mcap", "recorder"),
-        ("replay", "mcap", "recorder"),
-        ("metrics", "prometheus_client", "metrics"),
-    ],
-)
-def test_a_tool_without_its_extra_says_which_one_to_install(
-    start: Callable[..., Any], module: str, package: str, extra: str
-) -> None:
-    without = f"import runpy, sys; sys.modules[{package!r}] = None; runpy.run_module('palpate_server.{module}', run_name='__main__')"
-    assert_is_refused(start("-c", without), f"needs the package {package}: install palpate[{extra}]")
-
-
 def test_a_recording_that_exists_is_not_written_over(
     serve: Callable[..., Any], start: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from palpate.cli import COMMANDS
+
 
 def palpate(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "palpate.cli", *arguments],
+        [sys.executable, "-m", "palpate", *arguments],
         cwd=folder,
         capture_output=True,
         text=True,
@@ -32,17 +37,33 @@ def slab(tmp_path_factory: pytest.TempPathFactory, slab_scene: Callable[..., str
     return folder, done.stdout
 
 
-def test_build_shows_its_stages_and_the_evidence_and_writes_one_file(slab: tuple[Path, str]) -> None:
+def test_build_shows_its_stages_and_a_verdict_in_plain_words_and_writes_one_file(
+    slab: tuple[Path, str],
+) -> None:
     folder, printed = slab
     assert sorted(p.name for p in folder.iterdir()) == ["slab.npz", "slab.toml"]
     for words in (
         "node cloud",
         "modes",
         "reduction",
-        "error in band",
-        "error at 0 Hz",
-        "passivity margin",
+        "force while moving",
+        "force at rest",
+        "verdict: good",
         "wrote",
+    ):
+        assert words in printed
+    for words in ("H-infinity", "passivity margin", "spectral abscissa"):
+        assert words not in printed
+
+
+def test_every_figure_is_there_on_request(slab: tuple[Path, str]) -> None:
+    printed = palpate("inspect", "slab.npz", "--verbose", folder=slab[0]).stdout
+    for words in (
+        "verdict",
+        "error, H-infinity",
+        "passivity margin",
+        "spectral abscissa",
+        "error of the surface",
     ):
         assert words in printed
 
@@ -97,13 +118,17 @@ def test_method_and_order_can_be_chosen_on_the_command_line(slab: tuple[Path, st
         (["build", "none.toml"], "none.toml: no such configuration"),
         (["build", "slab.toml", "--order", "1"], "reduction.order = 1"),
         (["build", "slab.toml", "--tolerance", "200%"], "'200%'"),
-        (["build", "slab.toml", "--tolerance", "2%", "--order", "20"], "exclude each other"),
+        (["build", "slab.toml", "--tolerance", "2%", "--order", "20"], "not allowed with argument"),
         (["build", "slab.toml", "--method", "pod"], "reduction.method = 'pod'"),
         (
             ["build", "slab.toml", "-o", "slab.toml/x.npz"],
-            "slab.toml/x.npz: nothing can be written to slab.toml",
+            "slab.toml/x.npz: can't write to slab.toml",
         ),
         (["build", "slab.toml", "-o", "."], "is a folder"),
+        (["build", "slab.toml", "-o", "slab.toml"], "slab.toml is an input of this command"),
+        (["build", "slab.toml", "-o", "/dev/null"], "/dev/null is a device"),
+        (["inspect", "a\nb\x1b[31m"], r"argument 2, 'a\nb\x1b[31m', has characters that can't be shown"),
+        (["biuld"], "there is no command 'biuld': expected one of demo, build"),
         (["inspect", "slab.toml"], "slab.toml: damaged or not an .npz archive"),
         (["inspect", "none.npz"], "none.npz: no such model file"),
     ],
@@ -117,6 +142,8 @@ def test_a_mistake_ends_in_one_plain_message_and_exit_code_2(
     assert done.returncode == 2
     assert says in done.stderr
     assert "Traceback" not in done.stderr
+    if "usage" not in done.stderr:
+        assert len(done.stderr.splitlines()) == 1
     assert sorted(folder.iterdir()) == before
 
 
@@ -159,3 +186,61 @@ def test_a_scene_that_can_not_be_built_leaves_no_file(
     assert done.returncode == 2
     assert "Prony" in done.stderr or "elastic" in done.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["elastic.toml"]
+
+
+def test_the_help_groups_the_commands(tmp_path: Path) -> None:
+    done = palpate("--help", folder=tmp_path)
+    assert done.returncode == 0
+    assert done.stdout == palpate(folder=tmp_path).stdout
+    places = [done.stdout.index(f"\n{group}:\n") for group in ("Build a model", "Run it", "Touch it")]
+    assert places == sorted(places)
+    assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
+
+
+class TestInterrupt:
+    """Ctrl-C ends a build with code 130 and one line, whatever it is at."""
+
+    START = "from palpate.__main__ import main; print('ready', flush=True); main()"
+
+    @pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.3, 0.75, 1.5, 3.0])
+    def test_some_time_after_the_start(
+        self, tmp_path: Path, slab_scene: Callable[..., str], delay_s: float
+    ) -> None:
+        (tmp_path / "slab.toml").write_text(slab_scene())
+        with self.started(tmp_path) as build:
+            time.sleep(delay_s)  # a moment of the build, not a condition that is waited for
+            self.interrupt(build)
+        assert [p.name for p in tmp_path.iterdir()] == ["slab.toml"]
+
+    def test_an_interrupt_that_a_library_swallows(
+        self, tmp_path: Path, slab_scene: Callable[..., str]
+    ) -> None:
+        (tmp_path / "slab.toml").write_text(slab_scene())
+        # As trimesh does around its own imports.
+        (tmp_path / "scipy.py").write_text(
+            "import time\ntry:\n    print('importing', flush=True)\n    time.sleep(60)\nexcept BaseException:\n    pass\n"
+        )
+        with self.started(tmp_path, PYTHONPATH=str(tmp_path)) as build:
+            assert build.stdout is not None
+            while "importing" not in build.stdout.readline():
+                assert build.poll() is None
+            self.interrupt(build)
+
+    def started(self, folder: Path, **more: str) -> subprocess.Popen[str]:
+        build = subprocess.Popen(
+            [sys.executable, "-c", self.START, "build", "slab.toml"],
+            cwd=folder,
+            env=os.environ | more,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+        assert build.stdout is not None
+        assert build.stdout.readline() == "ready\n"
+        return build
+
+    def interrupt(self, build: subprocess.Popen[str]) -> None:
+        build.send_signal(signal.SIGINT)
+        _, err = build.communicate(timeout=120)
+        assert (build.returncode, err) == (130, "palpate: interrupted\n")

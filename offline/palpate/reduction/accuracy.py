@@ -164,34 +164,6 @@ def refuse_meaningless(accuracy: AccuracyReport, method: str) -> None:
             )
 
 
-def warnings(model: ReducedModel) -> tuple[str, ...]:
-    """What a person should know before using the model, a sentence each; empty where there is nothing."""
-    accuracy, advice = model.accuracy, _advice(model.method)
-    low, high = accuracy.band_hz
-    found = []
-    for error, where in (
-        (accuracy.error_in_band, f"In {low:g}-{high:g} Hz"),
-        (accuracy.error_static, "At 0 Hz"),
-    ):
-        if error > NOTABLE_ERROR:
-            worse = " (a model that always answers zero is wrong by 100 %)" if error > 1 else ""
-            found.append(f"{where} the force is wrong by up to {100 * error:.0f} %{worse}: {advice}.")
-    if accuracy.error_step > max(NOTABLE_ERROR, 2 * accuracy.error_static):
-        found.append(
-            f"Later than 0.2 s after a jump of the tip the force is wrong by up to {100 * accuracy.error_step:.0f} % of the "
-            "static force: the body rings near half the sampling rate; give the material a branch of short tau_s."
-        )
-    if model.continuous.n_padding:
-        found.append(
-            f"Order {model.order - 1} is stored as {model.order}: the form that runs has blocks of two states, and one is padding."
-        )
-    return tuple(found)
-
-
-def _advice(method: str) -> str:
-    return "raise the order" if method == "tbr-band" else "raise the order or use tbr-band"
-
-
 def _smooth_step(x: Array) -> Array:
     """0 for x <= 0, 1 for x >= 1, twice continuously differentiable: 10 x³ - 15 x⁴ + 6 x⁵."""
     t = np.clip(x, 0.0, 1.0)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import cont2discrete
 
 from palpate.model_file import AccuracyReport, Contact, PoleResidueSystem, ReducedModel, StateSpace, Surface
 
@@ -42,15 +41,19 @@ def spring_mass_model(n_contacts: int = 1, n_modes: int = 4, period_s: float = 1
         # In this basis 1 / ((s - real)² + imaginary²) is [1, 0] (sI - A)^-1 [0, 1/imaginary].
         b = np.vstack([np.zeros(channels), p / imaginary])
         c = np.column_stack([-p, np.zeros(channels)])
-        ad, bd, cd, dd, _ = cont2discrete((a, b, c, np.zeros((channels, channels))), period_s, method="foh")
+        # The block acts as the complex number real + j imaginary, and so do its functions in the first-order hold.
+        z = complex(real, imaginary) * period_s
+        decay, ramp = np.exp(z), period_s * (np.expm1(z) - z) / z**2
+        held = period_s * np.expm1(z) / z - ramp + decay * ramp
+        ad, weight, newest = (np.array([[f.real, f.imag], [-f.imag, f.real]]) for f in (decay, held, ramp))
         rows = slice(2 * k, 2 * k + 2)
-        for kind, block, inputs, outputs in (("continuous", a, b, c), ("discrete", ad, bd, cd)):
+        for kind, block, inputs, outputs in (("continuous", a, b, c), ("discrete", ad, weight @ b, c)):
             part = parts[kind]
             part["diagonal"][rows] = np.diag(block)
             part["cross"][rows] = block[[0, 1], [1, 0]]
             part["b"][rows] = inputs
             part["c"][:, rows] = outputs
-        parts["discrete"]["d"] += dd
+        parts["discrete"]["d"] += c @ newest @ b
 
     # 1 / ((s - pole)(s - conj pole)) in partial fractions
     poles = -damping * frequencies + 1j * frequencies * np.sqrt(1 - damping**2)

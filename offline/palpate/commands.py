@@ -1,0 +1,138 @@
+"""The commands of the offline side. Each imports what it needs only when it runs."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from importlib.resources import files
+from pathlib import Path
+
+from palpate import interrupts
+from palpate.stages import stage_reporter
+
+
+def build() -> None:
+    """Build a scene into a model file and say how accurate it is."""
+    parser = argparse.ArgumentParser(description=build.__doc__)
+    parser.add_argument("scene", type=Path, help="a TOML file such as configs/liver.toml")
+    parser.add_argument(
+        "--output", "-o", type=Path, metavar="FILE.npz", help="(default: NAME.npz of the scene)"
+    )
+    parser.add_argument(
+        "--method", help="of the reduction: tbr, tbr-band, hankel-optimal, modal or modal-static (default: the scene's)"
+    )
+    stop = parser.add_mutually_exclusive_group()
+    stop.add_argument("--order", type=int, help="number of states of the reduced model")
+    stop.add_argument(
+        "--tolerance", help="largest relative force error in the haptic band, such as 0.02 or 2%%"
+    )
+    parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")
+    options = parser.parse_args()
+
+    from palpate.files import check_output
+    from palpate.model_file import save_model
+    from palpate.report import accuracy_text
+    from palpate.scene.schema import load_config, override_reduction
+
+    scene = load_config(options.scene)
+    if (options.method, options.order, options.tolerance) != (None, None, None):
+        wanted = None if options.tolerance is None else parse_tolerance(options.tolerance)
+        scene = override_reduction(scene, options.method, options.order, wanted, "command line")
+    path = options.output or Path(f"{scene.name}.npz")
+    inputs = [options.scene]
+    if surface := getattr(scene.geometry, "file", None):
+        inputs.append(options.scene.parent / surface)
+    check_output(path, inputs)
+    start = time.monotonic()
+    with stage_reporter() as stages:
+        stages("libraries")
+        with interrupts.ends_at_once():
+            from palpate.build import build_model
+
+        model = build_model(scene, options.scene.parent, stages)
+        interrupts.check()
+    save_model(model, path, inputs)
+    print(accuracy_text(model, options.verbose))
+    print(f"\nwrote {path} ({path.stat().st_size / 2**20:.1f} MiB) in {time.monotonic() - start:.0f} s")
+
+
+def parse_tolerance(text: str) -> float:
+    """A relative error as `0.02` or `2%`. Raises ValueError."""
+    try:
+        value = float(text.removesuffix("%")) * (0.01 if text.endswith("%") else 1.0)
+    except ValueError:
+        raise ValueError(
+            f"--tolerance {text!r}: expected a fraction such as 0.02, or a percentage such as 2%"
+        ) from None
+    if not 0 < value < 1:
+        raise ValueError(f"--tolerance {text!r}: expected above 0 and below 1 (100%)")
+    return value
+
+
+def inspect() -> None:
+    """Say what a model file holds and how accurate it is."""
+    parser = argparse.ArgumentParser(description=inspect.__doc__)
+    parser.add_argument("model", type=Path, metavar="MODEL.npz")
+    parser.add_argument("--json", action="store_true", help="all figures, machine-readable")
+    parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")
+    options = parser.parse_args()
+
+    from palpate.model_file import load_model
+    from palpate.report import accuracy_text
+
+    model = load_model(options.model)
+    print(json.dumps(model.summary(), indent=2) if options.json else accuracy_text(model, options.verbose))
+
+
+def demo() -> None:
+    """Build the liver unless it is built, serve it in a second process, poke it, and draw what was felt."""
+    parser = argparse.ArgumentParser(description=demo.__doc__)
+    parser.add_argument(
+        "--out", type=Path, default=Path("out"), help="folder for the model and the picture (%(default)s)"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=5.0, help="how long to poke, 1 to 600 s (%(default)g)"
+    )
+    parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")
+    options = parser.parse_args()
+    if not 1 <= options.seconds <= 600:
+        parser.error(f"--seconds {options.seconds:g}: expected 1 to 600")
+    with stage_reporter() as stages:
+        stages("libraries")
+        with interrupts.ends_at_once():
+            from palpate.demo import run_demo
+            from palpate.report import accuracy_text
+
+        scene = Path(str(files("palpate_configs") / "liver.toml"))
+        summary = run_demo(scene, options.out, options.seconds, stages)
+    print(accuracy_text(summary.model, options.verbose), *summary.lines(), sep="\n")
+
+
+def reproduce() -> None:
+    """Regenerate the figures of BaniHani & De 2009, and three beyond them, each as a plot and a table."""
+    parser = argparse.ArgumentParser(description=reproduce.__doc__)
+    parser.add_argument(
+        "--figure",
+        type=int,
+        action="append",
+        default=[],
+        metavar="N",
+        help="2 to 16; again for more (default: all)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out"),
+        help="folder for the page paper.md and its images (%(default)s)",
+    )
+    parser.add_argument("--quick", action="store_true", help="small node clouds, about a minute")
+    options = parser.parse_args()
+    with stage_reporter() as stages:
+        stages("libraries")
+        with interrupts.ends_at_once():
+            from palpate_paper.reproduce import reproduce as regenerate
+
+        written = regenerate(options.figure, options.out, options.quick, stages)
+    for path in written:
+        print(f"wrote {path}")
