@@ -108,19 +108,3 @@ def test_a_command_whose_extra_is_missing_says_which_one_to_install(
     assert done.stderr == (
         f"error: {arguments[0]} needs the package {missing}, which is not installed: pip install '{wanted}'\n"
     )
-
-
-def test_imports_between_the_packages_go_one_way() -> None:
-    root = Path(__file__).parents[1]
-    allowed = {
-        "client/palpate_client": {"palpate_client", "palpate.files"},
-        "server/palpate_server": {"palpate_server", "palpate_client", "palpate.model_file", "palpate.files"},
-        "offline/palpate": {"palpate", "palpate_client", "palpate_paper.reproduce", "palpate_paper.time_integration"},
-        "offline/palpate_paper": {"palpate", "palpate_paper"},
-    }
-    imported = re.compile(r"^\s*(?:from|import) (palpate[a-z_.]*)(?: import (\w+))?", re.MULTILINE)
-    for folder, may in allowed.items():
-        for file in (root / folder).rglob("*.py"):
-            for module, name in imported.findall(file.read_text(encoding="utf-8")):
-                full = f"{module}.{name}"
-                assert any(full == m or full.startswith(f"{m}.") for m in may), f"{file} imports {full}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import io
 import json
 import math
 import sys
@@ -19,6 +20,7 @@ from typing import Any
 
 import zenoh
 
+from palpate.files import check_output, write_atomically
 from palpate_client.arguments import add_connection_options, connection_for, positive
 from palpate_client.connection import Connection, steps
 from palpate_client.errors import ClientError, ServerGone, ToolLost
@@ -43,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(connection: Connection, options: argparse.Namespace) -> int:
     if options.record:
-        Path(options.record).touch()  # better to fail now than after the poke
+        check_output(Path(options.record))  # better to fail now than after the poke
     tool = Tool(connection, options.tool, silence_s=options.silence_s)
     messages: list[dict[str, Any]] = []
     if options.record:
@@ -142,17 +144,18 @@ def wrote(path: str, description: Description, messages: list[dict[str, Any]]) -
         header += [f"{name}.position_{axis}_m" for axis in "xyz"]
         header += [f"{name}.force_{axis}_n" for axis in "xyz"]
     try:
-        with Path(path).open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(header)
-            for message in messages:
-                row = [message["tick"], message["server_time_ns"]]
-                for i in range(len(names)):
-                    row += [message["sequence"][i], message["flags"][i], message["force_scale"][i]]
-                    row += message["position_m"][i] + message["force_n"][i]
-                writer.writerow(row)
+        table = io.StringIO(newline="")
+        writer = csv.writer(table)
+        writer.writerow(header)
+        for message in messages:
+            row = [message["tick"], message["server_time_ns"]]
+            for i in range(len(names)):
+                row += [message["sequence"][i], message["flags"][i], message["force_scale"][i]]
+                row += message["position_m"][i] + message["force_n"][i]
+            writer.writerow(row)
+        write_atomically(Path(path), table.getvalue().encode())
     except OSError as error:
-        print(f"palpate client: {path}: {error.strerror}", file=sys.stderr)
+        print(f"palpate client: {error}", file=sys.stderr)
         return False
     return True
 

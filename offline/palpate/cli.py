@@ -43,7 +43,7 @@ def main() -> int:
     for position, text in enumerate(arguments, 1):
         if not text.isprintable():  # it would reach the terminal in some message
             return _fail(
-                f"argument {position}, '{text}', has characters that can't be shown: expected plain text"
+                f"argument {position}, '{printable(text)}', has characters that can't be shown: expected plain text"
             )
     name = arguments[0] if arguments else "--help"
     if name in ("--help", "-h"):

@@ -20,7 +20,8 @@ def build() -> None:
         "--output", "-o", type=Path, metavar="FILE.npz", help="(default: NAME.npz of the scene)"
     )
     parser.add_argument(
-        "--method", help="of the reduction: tbr, tbr-band, hankel-optimal, modal or modal-static (default: the scene's)"
+        "--method",
+        help="of the reduction: tbr, tbr-band, hankel-optimal, modal or modal-static (default: the scene's)",
     )
     stop = parser.add_mutually_exclusive_group()
     stop.add_argument("--order", type=int, help="number of states of the reduced model")

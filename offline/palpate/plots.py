@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
+from palpate.files import write_atomically
 from palpate.lti.stepping import step_through
 from palpate.model_file import ReducedModel
 
@@ -106,7 +108,9 @@ def draw_touch(model: ReducedModel, touch: Touch, contact: int, path: Path) -> N
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
     right.suptitle("What the client felt through the 1 kHz server")
-    figure.savefig(path, dpi=110)
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=110)
+    write_atomically(path, picture.getvalue())
     plt.close(figure)
 
 

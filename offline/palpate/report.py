@@ -41,7 +41,9 @@ def advice(model: ReducedModel) -> list[str]:
             "After a jump: the body rings near half the sampling rate; give the material a branch of short tau_s."
         )
     if model.continuous.n_padding:
-        found.append(f"Order {model.order - 1} is stored as {model.order}: states come in pairs, one is padding.")
+        found.append(
+            f"Order {model.order - 1} is stored as {model.order}: states come in pairs, one is padding."
+        )
     if accuracy.resolved_frequency_hz < accuracy.band_hz[1]:
         factor = accuracy.resolved_frequency_hz / accuracy.band_hz[1]
         found.append(

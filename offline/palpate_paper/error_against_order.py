@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from palpate.build import FullModel, build_full_model
+from palpate.files import write_atomically
 from palpate.lti.frequencies import all_frequencies, band_frequencies, spectral_norms
 from palpate.plots import require_matplotlib
 from palpate.reduction.methods import METHODS, reductions
 from palpate.scene.schema import load_config
-from palpate.stages import stage_reporter
 
 ORDERS = (20, 40, 60, 80, 100, 120, 160, 200)
 
@@ -77,13 +78,14 @@ def error_against_order(
 
 def write_table(rows: Sequence[Row], path: Path) -> None:
     """Comma-separated values with a header."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["method", "order", "error_in_band", "error_static", "error_hinf"])
-        writer.writerows(
-            [r.method, r.order, f"{r.error_in_band:.4e}", f"{r.error_static:.4e}", f"{r.error_hinf:.4e}"]
-            for r in rows
-        )
+    table = io.StringIO()
+    writer = csv.writer(table)
+    writer.writerow(["method", "order", "error_in_band", "error_static", "error_hinf"])
+    writer.writerows(
+        [r.method, r.order, f"{r.error_in_band:.4e}", f"{r.error_static:.4e}", f"{r.error_hinf:.4e}"]
+        for r in rows
+    )
+    write_atomically(path, table.getvalue().encode())
 
 
 def draw(rows: Sequence[Row], title: str, band_hz: tuple[float, float], path: Path) -> None:
@@ -117,7 +119,9 @@ def draw(rows: Sequence[Row], title: str, band_hz: tuple[float, float], path: Pa
     axes[0].set_ylabel("relative error")
     axes[0].legend(frameon=False)
     figure.suptitle(title)
-    figure.savefig(path, dpi=110)
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=110)
+    write_atomically(path, picture.getvalue())
     plt.close(figure)
 
 

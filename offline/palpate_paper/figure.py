@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from palpate.files import write_atomically
 from palpate.plots import require_matplotlib
 
 Cell = str | float | int
@@ -42,10 +44,11 @@ class Figure:
 
     def write(self, folder: Path) -> None:
         """STEM.csv and STEM.png in the folder, which must exist."""
-        with (folder / f"{self.stem}.csv").open("w", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(self.columns)
-            writer.writerows([_text(cell) for cell in row] for row in self.rows)
+        table = io.StringIO()
+        writer = csv.writer(table, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows([_text(cell) for cell in row] for row in self.rows)
+        write_atomically(folder / f"{self.stem}.csv", table.getvalue().encode())
         require_matplotlib()
         import matplotlib as mpl
 
@@ -54,19 +57,21 @@ class Figure:
 
         canvas = plt.figure(figsize=self.size, layout="constrained")
         self.draw(canvas)
-        path = folder / f"{self.stem}.png"
-        canvas.savefig(path, dpi=95)
+        picture = io.BytesIO()
+        canvas.savefig(picture, format="png", dpi=95)
         plt.close(canvas)
-        _use_palette(path)
+        write_atomically(folder / f"{self.stem}.png", _with_palette(picture))
 
 
-def _use_palette(path: Path) -> None:
-    """256 colors are enough for lines and text, in half the bytes."""
+def _with_palette(picture: io.BytesIO) -> bytes:
+    """The same PNG in 256 colors: enough for lines and text, in half the bytes."""
     from PIL import Image
 
-    with Image.open(path) as image:
+    with Image.open(picture) as image:
         reduced = image.convert("RGB").quantize(256, dither=Image.Dither.NONE)
-    reduced.save(path, optimize=True)
+    smaller = io.BytesIO()
+    reduced.save(smaller, format="png", optimize=True)
+    return smaller.getvalue()
 
 
 def _text(cell: Cell) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from palpate.files import write_atomically
 from palpate_paper.examples import DISC_DRAG_PER_S
 from palpate_paper.figure import Figure
 
@@ -86,4 +87,4 @@ def write_page(figures: Sequence[Figure], path: Path, quick: bool) -> None:
             parts.append(f"*The paper:* {_PAPER[figure.number]}\n")
         parts.append(f"![{figure.title}](images/paper/{figure.stem}.png)\n")
         parts.append(f"{figure.findings}\n")
-    path.write_text("\n".join(parts), encoding="utf-8")
+    write_atomically(path, "\n".join(parts).encode())

@@ -16,13 +16,12 @@ from palpate.lti.frequencies import (
 )
 from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.lti.stepping import step_through
-from palpate.model_file import AccuracyReport, ReducedModel
+from palpate.model_file import AccuracyReport
 from palpate.reduction.methods import Reduction
 from palpate.reduction.passivity import largest_energy_out, passive_up_to, passivity_margin
 
 Array = NDArray[np.float64]
 
-NOTABLE_ERROR = 0.1
 """A relative error above this is not what a model is built for: the build warns."""
 
 _MEANINGLESS_ERROR = 100.0

@@ -24,6 +24,7 @@ from pathlib import Path
 
 import zenoh
 
+from palpate.files import create_new
 from palpate_client import ClientError, wire
 from palpate_client.arguments import add_connection_options, connection_for, positive
 from palpate_server.arguments import need
@@ -124,12 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with connection_for(options) as connection:
             keys = connection.keys
-            try:
-                stream = options.out.open("xb")
-            except FileExistsError:
-                raise ValueError(f"{options.out} exists: expected the name of a new file") from None
-            except OSError as error:
-                raise ValueError(f"{options.out}: {error.strerror}") from error
+            stream = create_new(options.out)
             end_s = time.monotonic() + (options.duration_s or math.inf)
             try:
                 recording = Recording(stream)
