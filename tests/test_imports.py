@@ -160,7 +160,7 @@ def test_the_offline_rooms_import_along_the_chain(all_imports: list[Import]) -> 
     ("module", "source", "allowed"),
     [
         ("palpate_client.tool", "import palpate_server.wire", False),
-        ("palpate_client.tool", "from palpate import files", False),
+        ("palpate_client.tool", "from palpate import model_file", False),
         ("palpate_server.session.server", "from palpate_client.wire import KEYS", True),
         ("palpate_server.session.server", "from palpate_client import Connection", False),
         ("palpate_server.session.server", "from palpate.reduction import reduce", False),

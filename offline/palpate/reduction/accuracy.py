@@ -22,8 +22,6 @@ from palpate.reduction.passivity import largest_energy_out, passive_up_to, passi
 
 Array = NDArray[np.float64]
 
-"""A relative error above this is not what a model is built for: the build warns."""
-
 _MEANINGLESS_ERROR = 100.0
 """A relative error above this is round-off, not a reduction: the build is refused."""
 
@@ -161,6 +159,10 @@ def refuse_meaningless(accuracy: AccuracyReport, method: str) -> None:
                 f"the reduced model's force is wrong by {100 * error:.3g} % {where}, expected at most "
                 f"{100 * _MEANINGLESS_ERROR:.0f} %: {_advice(method)}, or check the material's constants"
             )
+
+
+def _advice(method: str) -> str:
+    return "raise the order" if method == "tbr-band" else "raise the order or use tbr-band"
 
 
 def _smooth_step(x: Array) -> Array:
