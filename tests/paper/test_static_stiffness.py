@@ -83,7 +83,7 @@ def test_the_bonded_punch_converges_further(punch):
 
 @pytest.mark.slow
 def test_the_livers_tip_stiffness_changes_by_less_than_five_percent_when_the_spacing_there_is_halved():
-    folder = Path(__file__).parents[3] / "configs"
+    folder = Path(__file__).parents[2] / "configs"
     config = load_config(folder / "liver.toml")
     (tip,) = config.contact
     stiffness = []
