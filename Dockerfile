@@ -5,7 +5,6 @@ COPY pyproject.toml README.md LICENSE constraints.txt ./
 COPY offline offline
 COPY server server
 COPY client client
-COPY client_examples client_examples
 COPY configs configs
 RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheel . \
     && python -m venv /opt/palpate \

@@ -31,10 +31,11 @@ def build() -> None:
     parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")
     options = parser.parse_args()
 
-    from palpate.files import check_output
-    from palpate.model_file import save_model
-    from palpate.report import accuracy_text
-    from palpate.scene.schema import load_config, override_reduction
+    with interrupts.ends_at_once():
+        from palpate.files import check_output
+        from palpate.model_file import save_model
+        from palpate.report import accuracy_text
+        from palpate.scene.schema import load_config, override_reduction
 
     scene = load_config(options.scene)
     if (options.method, options.order, options.tolerance) != (None, None, None):
@@ -79,8 +80,9 @@ def inspect() -> None:
     parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")
     options = parser.parse_args()
 
-    from palpate.model_file import load_model
-    from palpate.report import accuracy_text
+    with interrupts.ends_at_once():
+        from palpate.model_file import load_model
+        from palpate.report import accuracy_text
 
     model = load_model(options.model)
     print(json.dumps(model.summary(), indent=2) if options.json else accuracy_text(model, options.verbose))
