@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 from skimage.measure import marching_cubes
 
+from palpate.geometry.measures import enclosed_volume
 from palpate.geometry.sampling import depth_inside
-from palpate.geometry.surface import enclosed_volume, load_surface
+from palpate.geometry.surface import load_surface
 
 HEADER_BYTES = 256
 LIVER = 255

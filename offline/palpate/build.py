@@ -26,6 +26,7 @@ from palpate.reduction.accuracy import measure, refuse_meaningless
 from palpate.reduction.methods import Reduction, reduce
 from palpate.reduction.surface import fit_surface_output
 from palpate.scene.material import Material
+from palpate.scene.plausibility import plausibility
 from palpate.scene.schema import Config, ReductionTable, canonical_text, fingerprint
 from palpate.scene_cloud import build_cloud, contact_patches, fixed_nodes, shown_surface
 
@@ -96,7 +97,9 @@ def build_full_model(config: Config, folder: Path, progress: Progress = NO_PROGR
     """Everything up to the reduction. Raises as `build_model`."""
     material = config.material.material()
     progress("node cloud")
-    cloud = build_cloud(config, folder)
+    cloud = build_cloud(config, folder, progress)
+    for text in plausibility(config, float(np.max(np.ptp(cloud.points, axis=0)))):
+        progress.warn(text)
     fixed = fixed_nodes(config, cloud)
     patches = contact_patches(config, cloud, fixed)
     progress.note(

@@ -13,12 +13,18 @@ class Progress(Protocol):
     def note(self, text: str) -> None:
         """The result of the stage so far, in a few words."""
 
+    def warn(self, text: str) -> None:
+        """A sentence the user should read: what is unusual, and what was probably meant."""
+
 
 class _NoProgress:
     def __call__(self, stage: str) -> None:
         pass
 
     def note(self, text: str) -> None:
+        pass
+
+    def warn(self, text: str) -> None:
         pass
 
 

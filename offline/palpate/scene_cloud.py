@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.geometry import regions
 from palpate.geometry.cloud import NodeCloud, TriangleSurface
 from palpate.geometry.fill import fill_surface
 from palpate.geometry.refinement import refine_surface
@@ -15,15 +14,12 @@ from palpate.geometry.regions import ContactPatch, contact_patch, nodes_in
 from palpate.geometry.shapes import ball, box_lattice
 from palpate.geometry.spacing import Refinement, SpacingField
 from palpate.geometry.surface import load_surface
+from palpate.progress import NO_PROGRESS, Progress
 from palpate.scene.schema import (
     BallGeometry,
     BoxGeometry,
-    BoxRegion,
     Config,
     ContactTable,
-    NearestRegion,
-    PlaneRegion,
-    SphereRegion,
     SurfaceGeometry,
 )
 
@@ -36,13 +32,11 @@ _NEAR_SURFACE = 0.1
 _LEAST_PATCH = 0.25
 """Smallest area of a patch over that of a flat disc of its radius; a patch that wraps around the body has less."""
 
-_UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-
 _SHOWN_EDGE = 1.5
 """Longest triangle edge of the surface that is shown near a refined contact, in node spacings."""
 
 
-def build_cloud(config: Config, folder: Path) -> NodeCloud:
+def build_cloud(config: Config, folder: Path, progress: Progress = NO_PROGRESS) -> NodeCloud:
     """The nodes of the scene's body; files are relative to `folder`.
 
     Raises FileNotFoundError, SurfaceError or ValueError.
@@ -53,16 +47,18 @@ def build_cloud(config: Config, folder: Path) -> NodeCloud:
         case BallGeometry(radius_m=radius, spacing_m=spacing):
             return ball(radius, spacing)
         case SurfaceGeometry(file=file, file_unit=unit, spacing_m=spacing):
-            surface = load_surface(folder / file, unit_m=_UNITS_M[unit])
-            return fill_surface(surface, spacing, _refinements(config))
+            loaded = load_surface(folder / file, unit)
+            for note in loaded.notes:
+                progress.warn(note)
+            return fill_surface(loaded.surface, spacing, _refinements(config))
 
 
 def fixed_nodes(config: Config, cloud: NodeCloud) -> Indices:
     """(n_fixed,), ascending: the boundary nodes in any of the scene's fixed regions. Raises ValueError naming the region."""
     held = []
-    for index, table in enumerate(config.fixed):
+    for index, region in enumerate(config.fixed):
         try:
-            held.append(nodes_in(_region(table), cloud))
+            held.append(nodes_in(region, cloud))
         except ValueError as error:
             raise ValueError(f"fixed[{index}]: {error}") from error
     return np.unique(np.concatenate(held))
@@ -111,18 +107,6 @@ def _refinements(config: Config) -> tuple[Refinement, ...]:
     )
 
 
-def _region(table: BoxRegion | PlaneRegion | SphereRegion | NearestRegion) -> regions.Region:
-    match table:
-        case BoxRegion(lower_m=lower, upper_m=upper):
-            return regions.BoxRegion(lower, upper)
-        case PlaneRegion(point_m=point, normal=normal):
-            return regions.PlaneRegion(point, normal)
-        case SphereRegion(center_m=center, radius_m=radius):
-            return regions.SphereRegion(center, radius)
-        case NearestRegion(point_m=point):
-            return regions.NearestRegion(point)
-
-
 def _patch(table: ContactTable, cloud: NodeCloud) -> ContactPatch:
     try:
         patch = contact_patch(table.point_m, table.radius_m, cloud)
@@ -134,7 +118,7 @@ def _patch(table: ContactTable, cloud: NodeCloud) -> ContactPatch:
     if away > max(reach, _NEAR_SURFACE * float(np.linalg.norm(high - low))):
         raise ValueError(
             f"contact {table.name!r}: point_m = {list(table.point_m)} is {away:.3g} m from the surface: expected a point "
-            f"near it (the body reaches from {low.round(4).tolist()} to {high.round(4).tolist()})"
+            f"near it (the body reaches from {low.round(4).tolist()} to {high.round(4).tolist()} m)"
         )
     area, disc = float(np.sum(cloud.areas[patch.nodes])), np.pi * table.radius_m**2
     if area < _LEAST_PATCH * disc and len(patch.nodes) > 1:

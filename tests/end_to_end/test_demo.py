@@ -23,6 +23,9 @@ class Stages:
     def note(self, text: str) -> None:
         pass
 
+    def warn(self, text: str) -> None:
+        pass
+
 
 def test_the_demonstration_ends_with_forces_and_a_picture_and_builds_once(
     tmp_path: Path, slab_scene: Callable[..., str]

@@ -8,7 +8,7 @@ import pytest
 from palpate.discretization import conservative
 from palpate.geometry.fill import fill_surface
 from palpate.geometry.regions import contact_patch
-from palpate.geometry.shapes import box_lattice, box_surface
+from palpate.geometry.shapes import box_lattice
 from palpate.geometry.spacing import Refinement
 from palpate.modes.dense import elastic_modes
 from palpate.scene.material import Material
@@ -51,7 +51,7 @@ def _punch_stiffness(spacing, growth):
     """Normal stiffness of a tip of radius 1 bonded to the top of a block that is held at all other faces; G = 1."""
     r = HALF_WIDTH
     refinement = Refinement((0.0, 0.0, 0.0), 1.0, spacing, growth=growth, rings=True)
-    cloud = fill_surface(box_surface((-r, -r, -r), (r, r, 0)), r / 4, (refinement,))
+    cloud = fill_surface(box_lattice((-r, -r, -r), (r, r, 0), (2, 2, 2)).surface, r / 4, (refinement,))
     x = np.abs(cloud.points)
     held = np.flatnonzero((x[:, 0] > r - 1e-6) | (x[:, 1] > r - 1e-6) | (x[:, 2] > r - 1e-6))
     patch = contact_patch((0.0, 0.0, 0.0), 1.0, cloud)

@@ -16,8 +16,8 @@ from scipy.sparse import bsr_array, csr_array, diags_array
 from scipy.spatial import cKDTree
 
 from palpate.geometry.cloud import NodeCloud
+from palpate.geometry.measures import triangle_normals
 from palpate.geometry.sampling import sample_elements
-from palpate.geometry.surface import triangle_normals
 from palpate.meshfree import ShapeFunctions
 from palpate.meshfree.kernel import quartic_spline
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.geometry.cloud import INTERIOR, NodeCloud, TriangleSurface
+from palpate.geometry.measures import enclosed_volume, triangle_normals
 from palpate.geometry.sampling import Samples, closest_point, depth_inside, sample_elements, sample_inside
 from palpate.geometry.sharp_edges import sharp_edges
 from palpate.geometry.spacing import Refinement, SpacingField
-from palpate.geometry.surface import check_surface, enclosed_volume, triangle_normals
 from palpate.geometry.tributary import nearest_node, tributary_measures
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ _RELAXATIONS = 12
 def fill_surface(
     surface: TriangleSurface, spacing_m: float, refinements: Sequence[Refinement] = (), seed: int = 0
 ) -> NodeCloud:
-    """Fill the inside of a closed surface; the boundary nodes lie on it and come first.
+    """Fill the inside of a surface that `check_surface` accepts; the boundary nodes lie on it and come first.
 
     spacing_m    distance between nodes away from the refinements, m
     refinements  balls with nodes closer together
@@ -48,10 +48,8 @@ def fill_surface(
     Volumes and areas are what is nearest to the node, in samples 1/8 spacing apart, and sum to the body's; normals
     are the mean over that area. All boundary nodes have tag 1.
 
-    Raises SurfaceError when the surface bounds no body, ValueError when the spacing doesn't suit the body or a
-    round patch finds no place on it.
+    Raises ValueError when the spacing doesn't suit the body or a round patch finds no place on it.
     """
-    check_surface(surface)
     refinements = tuple(_fitted(r, surface) if r.rings else r for r in refinements)
     _check_spacing(surface, spacing_m, refinements)
     rng = np.random.default_rng(seed)
@@ -170,18 +168,34 @@ def _n_rings(patch: Refinement) -> int:
 
 def _patches(surface: TriangleSurface, field: SpacingField) -> Array:
     """(n, 3), nodes of the refinements with rings, m."""
-    patches = [_rings(surface, r) for r in field.refinements if r.rings]
+    refined = [r for r in field.refinements if r.rings]
+    patches = [_rings(surface, r) for r in refined]
     if not patches:
         return np.empty((0, 3))
+    for patch, nodes in zip(refined, patches, strict=True):
+        _refuse_folded(patch, nodes)
     nodes = np.vstack(patches)
-    pairs = cKDTree(nodes).query_pairs(0.5 * min(r.spacing_m for r in field.refinements if r.rings))
-    if pairs:
-        first = nodes[min(pairs)[0]]
-        raise ValueError(
-            f"refinements with rings overlap near {first.tolist()} m: expected round patches at least two "
-            "spacings apart"
-        )
+    owner = np.repeat(np.arange(len(patches)), [len(p) for p in patches])
+    nearest = 0.5 * min(r.spacing_m for r in refined)
+    for a, b in sorted(cKDTree(nodes).query_pairs(nearest)):
+        if owner[a] != owner[b]:
+            raise ValueError(
+                f"two round patches overlap near {nodes[a].tolist()} m: expected them at least two spacings apart"
+            )
     return nodes
+
+
+def _refuse_folded(patch: Refinement, nodes: Array) -> None:
+    """Raise ValueError where the surface folds so sharply that the patch's own nodes (n, 3) come too close."""
+    pairs = cKDTree(nodes).query_pairs(0.5 * patch.spacing_m, output_type="ndarray")
+    if len(pairs):
+        a, b = nodes[pairs[0]]
+        raise ValueError(
+            f"the surface around {list(patch.center_m)} m is too sharp or too thin for a round patch of radius "
+            f"{patch.radius_m:g} m: its nodes, {patch.spacing_m:.3g} m apart along the surface, come within "
+            f"{np.linalg.norm(a - b):.2g} m of each other near {a.round(6).tolist()} m. Expected a place that is nearly flat "
+            "over the patch, a smaller radius, or no finer spacing there (leave out the contact's spacing_m)"
+        )
 
 
 def _rings(surface: TriangleSurface, patch: Refinement) -> Array:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.sampling import closest_point
+from palpate.scene.regions import BoxRegion, NearestRegion, PlaneRegion, Region, SphereRegion
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -16,46 +17,6 @@ Vector = tuple[float, float, float]
 
 _EDGE = 1e-6
 """Nodes on the edge of a region belong to it: slack as a fraction of the node's spacing."""
-
-
-@dataclass(frozen=True)
-class BoxRegion:
-    """Boundary nodes within an axis-aligned box, m."""
-
-    lower_m: Vector
-    upper_m: Vector
-
-
-@dataclass(frozen=True)
-class PlaneRegion:
-    """Boundary nodes on the side of a plane that its normal points to, no further from it than `within_m` if given.
-
-    point_m    a point of the plane, m
-    normal     any length but 0
-    within_m   > 0, m
-    """
-
-    point_m: Vector
-    normal: Vector
-    within_m: float | None = None
-
-
-@dataclass(frozen=True)
-class SphereRegion:
-    """Boundary nodes within a sphere, m."""
-
-    center_m: Vector
-    radius_m: float
-
-
-@dataclass(frozen=True)
-class NearestRegion:
-    """The one boundary node nearest to a point, m; of several as near, the first in the cloud."""
-
-    point_m: Vector
-
-
-Region = BoxRegion | PlaneRegion | SphereRegion | NearestRegion
 
 
 class RegionError(ValueError):
@@ -81,19 +42,22 @@ class ContactPatch:
 def nodes_in(region: Region, cloud: NodeCloud) -> Indices:
     """Indices of the boundary nodes in the region, ascending, (k,) with k >= 1.
 
-    Raises RegionError when there are none, ValueError when the region itself makes no sense.
+    Raises RegionError when there are none.
     """
     boundary = np.flatnonzero(cloud.boundary)
+    points = cloud.points[boundary]
     if isinstance(region, NearestRegion):
-        distance = np.linalg.norm(cloud.points[boundary] - np.asarray(region.point_m), axis=1)
+        distance = np.linalg.norm(points - np.asarray(region.point_m), axis=1)
         return boundary[[np.argmin(distance)]]
-    outside = _distance_outside(region, cloud.points[boundary])
+    outside = _distance_outside(region, points)
     chosen = boundary[outside <= _EDGE * cloud.spacing[boundary]]
     if len(chosen) == 0:
-        nearest = boundary[np.argmin(outside)]
+        where = points[np.argmin(outside)]
+        low, high = cloud.surface.vertices.min(axis=0), cloud.surface.vertices.max(axis=0)
         raise RegionError(
-            f"{region} holds none of the {len(boundary)} boundary nodes: the nearest is node {nearest} at "
-            f"{cloud.points[nearest].tolist()} m, {outside.min():.4g} m outside it"
+            f"{_describe(region)} holds none of the {len(boundary)} nodes of the surface. The body reaches from "
+            f"{_rounded(low)} to {_rounded(high)} m; its nearest node, at {_rounded(where)} m, "
+            f"is {outside.min():.4g} m outside. Expected a region that holds part of the surface, in m"
         )
     return chosen
 
@@ -102,10 +66,8 @@ def contact_patch(point_m: Vector, radius_m: float, cloud: NodeCloud) -> Contact
     """Boundary nodes no further than `radius_m` from the surface point nearest to `point_m`.
 
     Nodes whose outward normal is at 90 degrees or more to the surface's there are left out: they belong to the
-    far side of a thin part. Raises RegionError when no node is left, ValueError when radius_m is not above 0.
+    far side of a thin part. Raises RegionError when no node is left.
     """
-    if not (np.isfinite(radius_m) and radius_m > 0):
-        raise ValueError(f"radius_m = {radius_m}: expected a length above 0")
     vertices, triangles = cloud.surface.vertices, cloud.surface.triangles
     closest, triangle = closest_point(np.array([point_m], dtype=float), vertices, triangles)
     center = closest[0]
@@ -126,21 +88,27 @@ def contact_patch(point_m: Vector, radius_m: float, cloud: NodeCloud) -> Contact
 
 def _distance_outside(region: BoxRegion | PlaneRegion | SphereRegion, points: Array) -> Array:
     """How far points (n, 3) lie outside the region, m, (n,); 0 or less within it."""
-    if isinstance(region, BoxRegion):
-        low, high = np.asarray(region.lower_m), np.asarray(region.upper_m)
-        if np.any(low > high):
-            raise ValueError(f"{region}: expected lower_m <= upper_m")
-        return np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=1)
-    if isinstance(region, SphereRegion):
-        if not region.radius_m > 0:
-            raise ValueError(f"{region}: expected radius_m above 0")
-        return np.linalg.norm(points - np.asarray(region.center_m), axis=1) - region.radius_m
-    length = np.linalg.norm(region.normal)
-    if not (np.isfinite(length) and length > 0):
-        raise ValueError(f"{region}: expected a normal that is not zero")
-    height = (points - np.asarray(region.point_m)) @ (np.asarray(region.normal) / length)
-    if region.within_m is None:
-        return -height
-    if not region.within_m > 0:
-        raise ValueError(f"{region}: expected within_m above 0")
-    return np.maximum(-height, height - region.within_m)
+    match region:
+        case BoxRegion():
+            low, high = np.asarray(region.lower_m), np.asarray(region.upper_m)
+            return np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=1)
+        case SphereRegion():
+            return np.linalg.norm(points - np.asarray(region.center_m), axis=1) - region.radius_m
+        case PlaneRegion():
+            normal = np.asarray(region.normal) / np.linalg.norm(region.normal)
+            return -(points - np.asarray(region.point_m)) @ normal
+
+
+def _describe(region: BoxRegion | PlaneRegion | SphereRegion) -> str:
+    """The region in the keys and numbers of the scene."""
+    match region:
+        case BoxRegion():
+            return f"the box from lower_m = {list(region.lower_m)} to upper_m = {list(region.upper_m)}"
+        case SphereRegion():
+            return f"the sphere of radius_m = {region.radius_m:g} around center_m = {list(region.center_m)}"
+        case PlaneRegion():
+            return f"the side of the plane through point_m = {list(region.point_m)} that normal = {list(region.normal)} points to"
+
+
+def _rounded(point: Array) -> list[float]:
+    return [float(f"{x:.4g}") for x in point]

@@ -84,15 +84,6 @@ def box_lattice(
     )
 
 
-def box_surface(lower: Vector, upper: Vector) -> TriangleSurface:
-    """The 12 triangles of a box between opposite corners, m. Raises ValueError when lower is not below upper."""
-    low, high = np.asarray(lower, float), np.asarray(upper, float)
-    _check_box(low, high)
-    n = np.array([2, 2, 2])
-    corners = _lattice_index(n)
-    return _lattice_surface(np.where(corners == 1, high, low), n)
-
-
 def ball(radius_m: float, spacing_m: float) -> NodeCloud:
     """Ball around the origin: a cubic lattice inside, spiral points on the surface.
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.geometry.cloud import TriangleSurface
-from palpate.geometry.surface import triangle_normals
+from palpate.geometry.measures import triangle_normals
 
 Indices = NDArray[np.int64]
 

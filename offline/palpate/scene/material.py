@@ -7,10 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+_RANGES = {
+    "youngs_modulus_pa": (1e-3, 1e13),
+    # At 0.5 no bulk modulus is finite; 0.49 is near enough for soft tissue.
+    "poissons_ratio": (-0.999, 0.49999),
+    "density_kg_per_m3": (1e-3, 1e6),
+    "gamma": (1e-9, 1e4),
+    "tau_s": (1e-9, 1e6),
+}
+"""Beyond these a number can only be a mistake, whatever the body is made of."""
+
 
 @dataclass(frozen=True)
 class PronySeries:
     """Relaxation of the stress, Eq. 9 of BaniHani & De 2009: gamma_j = E_j / E with time constant tau_j.
+
+    E is the modulus at rest (fully relaxed). Many publications divide by the instant modulus instead: with
+    g_j = E_j / E_instant, gamma_j = g_j / (1 - sum of all g).
 
     gamma  (n_terms,), dimensionless, > 0
     tau_s  (n_terms,), s, > 0 and distinct
@@ -25,8 +38,8 @@ class PronySeries:
                 f"gamma has {len(self.gamma)} terms and tau_s has {len(self.tau_s)}: expected as many"
             )
         for name, values in (("gamma", self.gamma), ("tau_s", self.tau_s)):
-            if not all(np.isfinite(v) and v > 0 for v in values):
-                raise ValueError(f"{name} = {list(values)}: expected finite numbers above 0")
+            for value in values:
+                check_constant(name, value)
         if len(set(self.tau_s)) != len(self.tau_s):
             raise ValueError(
                 f"tau_s = {list(self.tau_s)}: expected distinct time constants (add up equal ones)"
@@ -63,15 +76,8 @@ class Material:
     prony: PronySeries = PronySeries()
 
     def __post_init__(self) -> None:
-        for name in ("youngs_modulus_pa", "density_kg_per_m3"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} = {value}: expected a finite number above 0")
-        if not -1 < self.poissons_ratio < 0.5:
-            raise ValueError(
-                f"poissons_ratio = {self.poissons_ratio}: expected -1 < nu < 0.5 "
-                "(0.5 itself has no finite bulk modulus; 0.49 is near enough for soft tissue)"
-            )
+        for name in ("youngs_modulus_pa", "poissons_ratio", "density_kg_per_m3"):
+            check_constant(name, getattr(self, name))
 
     @property
     def shear_modulus_pa(self) -> float:
@@ -84,14 +90,13 @@ class Material:
         nu = self.poissons_ratio
         return self.youngs_modulus_pa * nu / ((1 + nu) * (1 - 2 * nu))
 
-    def elasticity_matrix(self) -> NDArray[np.float64]:
-        """(6, 6), Pa: C_e of Eq. 10, engineering strain order xx, yy, zz, xy, yz, zx."""
-        lam, mu = self.lame_lambda_pa, self.shear_modulus_pa
-        c = np.zeros((6, 6))
-        c[:3, :3] = lam
-        c[np.arange(3), np.arange(3)] += 2 * mu
-        c[np.arange(3, 6), np.arange(3, 6)] = mu
-        return c
+
+def check_constant(name: str, value: float) -> None:
+    """Raise ValueError unless a material constant lies within its range; the name is that of its field."""
+    low, high = _RANGES[name]
+    if not low <= value <= high:
+        hint = " (45 % is 0.45)" if name == "poissons_ratio" else ""
+        raise ValueError(f"{name} = {value}: expected from {low:g} to {high:g}{hint}")
 
 
 PRESETS: dict[str, Material] = {

@@ -1,22 +1,21 @@
-"""Scene files: what a TOML configuration may say, checked before anything is computed."""
+"""Scene files: what a TOML scene may say, checked before anything is computed."""
 
 from __future__ import annotations
 
 import hashlib
 import math
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from palpate.model_file import LONGEST_PERIOD_S, SHORTEST_PERIOD_S
-from palpate.scene.material import PRESETS, Material, PronySeries
+from palpate.scene.material import PRESETS, Material, PronySeries, check_constant
+from palpate.scene.quantities import SHORTEST_M, Count, Length, Number, Point, Table
+from palpate.scene.regions import Region
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
-Count = Annotated[int, Field(strict=True)]
-Point = tuple[Number, Number, Number]
 ReductionMethod = Literal["tbr", "tbr-band", "hankel-optimal", "modal", "modal-static"]
 
 
@@ -31,11 +30,7 @@ class ConfigError(ValueError):
     """A configuration says something that can't be built; the message names the key, the value and what is allowed."""
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class BoxGeometry(_Table):
+class BoxGeometry(Table):
     """A box of lattice nodes, faces included."""
 
     shape: Literal["box"]
@@ -47,8 +42,10 @@ class BoxGeometry(_Table):
 
     @model_validator(mode="after")
     def _is_a_box(self) -> BoxGeometry:
-        if any(u <= low for low, u in zip(self.lower_m, self.upper_m, strict=True)):
-            raise ValueError(f"upper_m = {list(self.upper_m)}: expected above lower_m = {list(self.lower_m)}")
+        if any(u < low + SHORTEST_M for low, u in zip(self.lower_m, self.upper_m, strict=True)):
+            raise ValueError(
+                f"upper_m = {list(self.upper_m)}: expected above lower_m = {list(self.lower_m)} by {SHORTEST_M:g} m or more"
+            )
         if min(self.counts) < 3:
             raise ValueError(f"counts = {list(self.counts)}: expected at least 3 along each axis")
         if math.prod(self.counts) > MAX_NODES:
@@ -56,12 +53,12 @@ class BoxGeometry(_Table):
         return self
 
 
-class BallGeometry(_Table):
+class BallGeometry(Table):
     """A ball about the origin."""
 
     shape: Literal["ball"]
-    radius_m: Positive
-    spacing_m: Positive
+    radius_m: Length
+    spacing_m: Length
 
     @model_validator(mode="after")
     def _is_of_a_size(self) -> BallGeometry:
@@ -74,69 +71,50 @@ class BallGeometry(_Table):
         return self
 
 
-class SurfaceGeometry(_Table):
+class SurfaceGeometry(Table):
     """The inside of a closed triangle surface."""
 
     shape: Literal["surface"]
     file: str = Field(description="STL, OBJ or PLY, relative to the configuration")
-    file_unit: Literal["m", "cm", "mm"] = "m"
-    spacing_m: Positive
+    file_unit: Literal["m", "cm", "mm"] = Field(default="m", description="unit of the file's coordinates")
+    spacing_m: Length
     growth: Number = Field(
         default=0.3, gt=0, le=0.5, description="growth of the spacing per meter away from a refined contact"
     )
 
 
-class BoxRegion(_Table):
-    """Boundary nodes inside an axis-aligned box."""
-
-    region: Literal["box"]
-    lower_m: Point
-    upper_m: Point
-
-
-class PlaneRegion(_Table):
-    """Boundary nodes on the side of a plane that its normal points to."""
-
-    region: Literal["plane"]
-    point_m: Point
-    normal: Point
-
-
-class SphereRegion(_Table):
-    """Boundary nodes inside a sphere."""
-
-    region: Literal["sphere"]
-    center_m: Point
-    radius_m: Positive
-
-
-class NearestRegion(_Table):
-    """The boundary node nearest to a point."""
-
-    region: Literal["nearest"]
-    point_m: Point
-
-
-class ContactTable(_Table):
+class ContactTable(Table):
     """A patch of the surface that a tool tip holds and moves as one rigid piece."""
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,31}$")
     point_m: Point = Field(description="the patch is centered at the surface point nearest to this")
-    radius_m: Positive
-    spacing_m: Positive | None = Field(
-        default=None, description="node spacing on the patch; unset: unrefined"
-    )
+    radius_m: Length
+    spacing_m: Length | None = Field(default=None, description="node spacing on the patch; unset: unrefined")
 
 
-class MaterialTable(_Table):
+class MaterialTable(Table):
     """A preset by name, with any of its constants replaced; or all constants."""
 
     preset: str | None = None
-    youngs_modulus_pa: Positive | None = None
-    poissons_ratio: Number | None = Field(default=None, gt=-1, lt=0.5)
-    density_kg_per_m3: Positive | None = None
-    gamma: tuple[Positive, ...] | None = None
-    tau_s: tuple[Positive, ...] | None = None
+    youngs_modulus_pa: Number | None = Field(default=None, description="at rest (fully relaxed), Pa")
+    poissons_ratio: Number | None = None
+    density_kg_per_m3: Number | None = None
+    gamma: tuple[Number, ...] | None = Field(
+        default=None,
+        description="stiffness of each relaxing branch over the stiffness at rest. Where a publication divides by the "
+        "instant stiffness, gamma_j = g_j / (1 - sum of all g)",
+    )
+    tau_s: tuple[Number, ...] | None = Field(default=None, description="time constant of each branch, s")
+
+    @field_validator("youngs_modulus_pa", "poissons_ratio", "density_kg_per_m3", "gamma", "tau_s")
+    @classmethod
+    def _is_within_its_range(
+        cls, value: float | tuple[float, ...] | None, info: ValidationInfo
+    ) -> float | tuple[float, ...] | None:
+        values = value if isinstance(value, tuple) else () if value is None else (value,)
+        for number in values:
+            check_constant(str(info.field_name), number)
+        return value
 
     @model_validator(mode="after")
     def _can_be_made(self) -> MaterialTable:
@@ -164,7 +142,7 @@ class MaterialTable(_Table):
         return Material(**values, prony=prony)
 
 
-class DiscretizationTable(_Table):
+class DiscretizationTable(Table):
     """`conservative` (symmetric, passive; the default) or the paper's `collocation`."""
 
     method: Literal["conservative", "collocation"] = "conservative"
@@ -173,13 +151,13 @@ class DiscretizationTable(_Table):
     )
 
 
-class ReductionTable(_Table):
+class ReductionTable(Table):
     """How the full model is reduced and sampled."""
 
     method: ReductionMethod = "tbr-band"
     order: Count | None = Field(default=None, ge=2, description="number of states")
-    tolerance: float | None = Field(
-        default=None, gt=0, lt=1, description="largest relative in-band force error"
+    tolerance: Number | None = Field(
+        default=None, ge=1e-12, lt=1, description="largest relative in-band force error"
     )
     band_hz: tuple[Number, Number] = (0.0, 30.0)
     period_s: Number = Field(default=1e-3, ge=SHORTEST_PERIOD_S, le=LONGEST_PERIOD_S)
@@ -200,15 +178,13 @@ class ReductionTable(_Table):
         return self
 
 
-class Config(_Table):
+class Config(Table):
     """A whole scene."""
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")
     geometry: Annotated[BoxGeometry | BallGeometry | SurfaceGeometry, Field(discriminator="shape")]
     material: MaterialTable
-    fixed: tuple[
-        Annotated[BoxRegion | PlaneRegion | SphereRegion | NearestRegion, Field(discriminator="region")], ...
-    ] = Field(min_length=1)
+    fixed: tuple[Annotated[Region, Field(discriminator="region")], ...] = Field(min_length=1)
     contact: tuple[ContactTable, ...] = Field(min_length=1)
     discretization: DiscretizationTable = DiscretizationTable()
     reduction: ReductionTable = ReductionTable(tolerance=0.02)
@@ -303,7 +279,7 @@ def _line(error: Any) -> str:
     key = ""
     for part in parts:
         key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
-    key = key or "configuration"
+    key = key or "scene"
     value = error["input"]
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "tuple_type" and len(parts) == 1 and parts[0] in ("fixed", "contact"):
@@ -321,6 +297,30 @@ def _line(error: Any) -> str:
             allowed = "'box', 'plane', 'sphere', 'nearest'" if tag == "region" else "'box', 'ball', 'surface'"
             return f"{key}.{tag}: missing, expected one of {allowed}"
         return f"{key}.{tag}{got}: expected one of {allowed}"
-    if isinstance(value, dict | list) and error["type"] == "value_error":
-        return f"{key}: {message}"
-    return f"{key} = {value!r}: {message[0].lower() + message[1:]}"
+    if error["type"] == "value_error":
+        if parts and message.startswith(f"{parts[-1]} = "):  # a field's own words
+            return key.removesuffix(str(parts[-1])) + message
+        named = re.match(r"\w+ = ", message) and parts  # a table's words about one of its fields
+        return f"{key}.{message}" if named else f"{key}: {message}" if parts else message
+    expected = message.removeprefix("Input should be ")
+    if error["type"] in _BOUNDS:
+        (bound,) = error["ctx"].values()
+        expected = f"{_BOUNDS[error['type']]} {bound:g}{_unit_hint(str(parts[-1]))}"
+    elif expected == message:
+        return f"{key} = {value!r}: {message[0].lower() + message[1:]}"
+    return f"{key} = {value!r}: expected {expected}"
+
+
+_BOUNDS = {
+    "greater_than": "above",
+    "greater_than_equal": "at least",
+    "less_than": "below",
+    "less_than_equal": "at most",
+}
+_UNIT_HINTS = {"period_s": "in s: 1 ms is 0.001", "tolerance": "a fraction: 2 % is 0.02"}
+
+
+def _unit_hint(key: str) -> str:
+    """The unit that a number is in."""
+    hint = _UNIT_HINTS.get(key) or ("in m: 5 mm is 0.005" if key.endswith("_m") else "")
+    return f" ({hint})" if hint else ""

@@ -6,7 +6,7 @@ import pytest
 from palpate.discretization import conservative
 from palpate.discretization.consistency import vector_areas
 from palpate.geometry.fill import fill_surface
-from palpate.geometry.shapes import ball, box_lattice, box_surface
+from palpate.geometry.shapes import ball, box_lattice
 from palpate.geometry.spacing import Refinement
 from palpate.meshfree import SupportError
 from palpate.modes.dense import elastic_modes, nodal_stiffness
@@ -71,7 +71,7 @@ CLOUDS = {
     "jittered": lambda: _cube(6, 0.25)[0],
     "ball": lambda: ball(1.0, 0.28),
     "graded": lambda: fill_surface(
-        box_surface((-1, -1, -1), (1, 1, 1)),
+        box_lattice((-1, -1, -1), (1, 1, 1), (2, 2, 2)).surface,
         0.5,
         (Refinement((0.2, 0.1, 1.0), 0.2, 0.1, growth=0.4, rings=True),),
     ),
@@ -139,7 +139,7 @@ def test_vector_areas_obey_the_divergence_theorem(cloud):
 
 
 def test_the_divergence_theorem_holds_to_local_round_off_where_spacing_spans_a_factor_of_twenty():
-    surface = box_surface((-20, -20, -20), (20, 20, 0))
+    surface = box_lattice((-20, -20, -20), (20, 20, 0), (2, 2, 2)).surface
     cloud = fill_surface(surface, 5.0, (Refinement((0.0, 0.0, 0.0), 0.5, 0.25, growth=0.5, rings=True),))
     assert cloud.spacing.max() / cloud.spacing.min() > 15
     basis, gradient = conservative.gradient_at_nodes(cloud)

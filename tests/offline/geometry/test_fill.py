@@ -7,14 +7,14 @@ from scipy.spatial import cKDTree
 
 from palpate.geometry.cloud import TriangleSurface
 from palpate.geometry.fill import fill_surface
+from palpate.geometry.measures import enclosed_volume
 from palpate.geometry.regions import contact_patch
 from palpate.geometry.sampling import closest_point, depth_inside
-from palpate.geometry.shapes import box_surface
+from palpate.geometry.shapes import box_lattice
 from palpate.geometry.spacing import Refinement, SpacingField
-from palpate.geometry.surface import SurfaceError, enclosed_volume
 
 RADIUS = 0.1
-BLOCK = box_surface((-0.05, -0.05, -0.06), (0.05, 0.05, 0.0))
+BLOCK = box_lattice((-0.05, -0.05, -0.06), (0.05, 0.05, 0.0), (2, 2, 2)).surface
 TIP = Refinement(center_m=(0.0, 0.0, 0.01), radius_m=0.007, spacing_m=0.0025, growth=0.3, rings=True)
 
 
@@ -180,18 +180,13 @@ def test_a_thin_wedge_leaves_no_node_without_a_volume():
         ),
         (1e-5, [], "spacing_m = 1e-05 would give some 6e[+]11 nodes .* expected at most 200000"),
         (0.01, [Refinement((0, 0, 0), 0.02, 1e-5)], "would give some .* nodes"),
-        (0.01, [TIP, Refinement((0.005, 0, 0), 0.006, 0.002, rings=True)], "rings overlap near"),
+        (0.01, [TIP, Refinement((0.005, 0, 0), 0.006, 0.002, rings=True)], "two round patches overlap near"),
         (0.02, [Refinement((0, 0, 0), 0.2, 0.02, rings=True)], "radius 0.2 m finds no place around"),
     ],
 )
 def test_a_fill_that_makes_no_sense_is_refused(spacing, refinements, message):
     with pytest.raises(ValueError, match=message):
         fill_surface(BLOCK, spacing, refinements)
-
-
-def test_an_open_surface_is_not_filled():
-    with pytest.raises(SurfaceError, match="open: 3 edges"):
-        fill_surface(TriangleSurface(BLOCK.vertices, BLOCK.triangles[1:]), 0.01)
 
 
 @pytest.mark.parametrize(

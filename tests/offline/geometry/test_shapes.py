@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from palpate.geometry.shapes import ball, box_lattice, box_surface
-from palpate.geometry.surface import check_surface, enclosed_volume
+from palpate.geometry.measures import enclosed_volume
+from palpate.geometry.shapes import ball, box_lattice
+from palpate.geometry.soundness import check_surface
 
 LOWER, UPPER = (-1.0, 0.0, 2.0), (1.0, 3.0, 3.0)
 COUNTS = (5, 7, 4)
@@ -90,7 +91,7 @@ def test_the_same_seed_gives_the_same_box_and_another_seed_another():
 
 @pytest.mark.parametrize(
     "surface",
-    [box_lattice(LOWER, UPPER, COUNTS).surface, box_surface(LOWER, UPPER)],
+    [box_lattice(LOWER, UPPER, COUNTS).surface, box_lattice(LOWER, UPPER, (2, 2, 2)).surface],
     ids=["lattice", "twelve triangles"],
 )
 def test_surface_of_a_box_is_closed_outward_and_holds_its_volume(surface):

@@ -1,0 +1,186 @@
+"""PLY, ASCII and binary of either byte order: positions and faces. Other properties and elements are skipped.
+
+Format: G. Turk, The PLY Polygon File Format, 1994.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.geometry.readers.polygons import (
+    Polygons,
+    ReadError,
+    check_finite,
+    numbered_lines,
+    parse_index,
+    parse_number,
+)
+
+_CODES = {
+    "char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d",
+    "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d",
+}  # fmt: skip
+"""From the names of types to the codes of `struct`."""
+_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_FACE_LISTS = ("vertex_indices", "vertex_index")
+
+Row = list[tuple[float, ...]]
+"""One element: the numbers of each of its properties."""
+
+
+@dataclass(frozen=True)
+class _Property:
+    """A number, or a list of numbers with a count before it."""
+
+    name: str
+    code: str
+    count_code: str | None = None
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    count: int
+    properties: list[_Property] = field(default_factory=list)
+
+    def index(self, *names: str) -> int | None:
+        """Position of the first property that has one of the names."""
+        return next((i for i, p in enumerate(self.properties) if p.name in names), None)
+
+
+def read_ply(data: bytes) -> Polygons:
+    """The faces of a PLY file. Raises ReadError."""
+    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", data)
+    if not re.match(rb"ply\s", data) or not end:
+        raise ReadError("not a PLY file: expected 'ply' in the first line, and a line 'end_header'")
+    header, body = data[: end.end()], data[end.end() :]
+    order, elements = _header(header)
+    if order:
+        rows = _binary_rows(body, order, elements)
+    else:
+        rows = _text_rows(body, elements, len(re.findall(rb"\r\n|\r|\n", header)))
+
+    vertex, face = (next((e for e in elements if e.name == name), None) for name in ("vertex", "face"))
+    axes = [] if vertex is None else [vertex.index(axis) for axis in "xyz"]
+    if vertex is None or None in axes:
+        raise ReadError("the header has no element 'vertex' with the properties x, y and z")
+    column = None if face is None else face.index(*_FACE_LISTS)
+    if face is None or column is None or face.properties[column].code in "fd":
+        raise ReadError(
+            "the header has no element 'face' with a list of whole numbers 'vertex_indices': expected a surface with "
+            "faces, not points or strips"
+        )
+    points = np.array(
+        [[row[axis][0] for axis in axes if axis is not None] for row in rows["vertex"]], np.float64
+    )
+    return _polygons(points.reshape(-1, 3), [row[column] for row in rows["face"]])
+
+
+def _polygons(vertices: NDArray[np.float64], faces: Sequence[tuple[float, ...]]) -> Polygons:
+    """The faces, if each has three vertices or more, all of which exist."""
+    check_finite(vertices, "vertex {}")
+    sizes = np.array([len(face) for face in faces], np.int64)
+    corners = np.array([corner for face in faces for corner in face], np.int64)
+    small = np.flatnonzero(sizes < 3)
+    if len(small):
+        raise ReadError(f"face {small[0]} has {sizes[small[0]]} vertices, expected at least 3")
+    beyond = np.flatnonzero((corners < 0) | (corners >= len(vertices)))
+    if len(beyond):
+        face = np.searchsorted(np.cumsum(sizes), beyond[0], side="right")
+        raise ReadError(
+            f"face {face} names vertex {corners[beyond[0]]}, but the file has vertices from 0 to {len(vertices) - 1}"
+        )
+    return Polygons(vertices, corners, sizes, first=0, indexed=True)
+
+
+def _header(header: bytes) -> tuple[str, list[_Element]]:
+    """Byte order ("" for ASCII, else that of `struct`) and the elements, in the order of the file."""
+    order: str | None = None
+    elements: list[_Element] = []
+    for number, line in numbered_lines(header):
+        match line.split():
+            case ["ply"] | ["end_header"] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", name, "1.0"] if name in _BYTE_ORDERS:
+                order = _BYTE_ORDERS[name]
+            case ["element", name, count] if count.isdecimal():
+                elements.append(_Element(name, int(count)))
+            case ["property", "list", count, code, name] if elements and {count, code} <= _CODES.keys():
+                elements[-1].properties.append(_Property(name, _CODES[code], _CODES[count]))
+            case ["property", code, name] if elements and code in _CODES:
+                elements[-1].properties.append(_Property(name, _CODES[code]))
+            case _:
+                raise ReadError(f"line {number}: {line[:60]!r} is no line of a PLY header")
+    if order is None:
+        raise ReadError(f"the header states no format, expected one of {', '.join(_BYTE_ORDERS)} and 1.0")
+    return order, elements
+
+
+def _text_rows(body: bytes, elements: list[_Element], n_header_lines: int) -> dict[str, list[Row]]:
+    """All rows of each element, a line each."""
+    lines = ((number + n_header_lines, line.split()) for number, line in numbered_lines(body))
+    rows: dict[str, list[Row]] = {}
+    for element in elements:
+        rows[element.name] = []
+        for done in range(element.count):
+            number, words = next(lines, (0, []))
+            if not words:
+                raise _truncated(element, done)
+            rows[element.name].append(_text_row(words, element, number))
+    for number, _ in lines:
+        raise ReadError(f"line {number}: more lines than the header states elements")
+    return rows
+
+
+def _text_row(words: list[str], element: _Element, line: int) -> Row:
+    row: Row = []
+    used = 0
+    for p in element.properties:
+        count = 1
+        if p.count_code is not None and used < len(words):
+            count = parse_index(words[used], line)
+            used += 1
+        parse = parse_number if p.code in "fd" else parse_index
+        row.append(tuple(parse(word, line) for word in words[used : used + max(count, 0)]))
+        used += count
+    if used != len(words):
+        raise ReadError(f"line {line}: {len(words)} numbers, expected {used} of a {element.name}")
+    return row
+
+
+def _binary_rows(body: bytes, order: str, elements: list[_Element]) -> dict[str, list[Row]]:
+    """All rows of each element."""
+    rows: dict[str, list[Row]] = {}
+    position = 0
+    for element in elements:
+        rows[element.name] = []
+        for done in range(element.count):
+            row: Row = []
+            try:
+                for p in element.properties:
+                    count = 1
+                    if p.count_code is not None:
+                        (count,) = struct.unpack_from(order + p.count_code, body, position)
+                        position += struct.calcsize(order + p.count_code)
+                    values = f"{order}{int(count)}{p.code}"
+                    row.append(struct.unpack_from(values, body, position))
+                    position += struct.calcsize(values)
+            except struct.error:  # the end of the file, or a negative count
+                raise _truncated(element, done) from None
+            rows[element.name].append(row)
+    if body[position:].strip():
+        raise ReadError(f"{len(body) - position:,} bytes more than the header states")
+    return rows
+
+
+def _truncated(element: _Element, done: int) -> ReadError:
+    return ReadError(
+        f"truncated: the header states {element.count:,} of '{element.name}', the file ends after {done:,}: copy or export "
+        "it again"
+    )

@@ -1,0 +1,168 @@
+"""Whether a triangle surface bounds one solid body: all faults at once, in the words of the file, with what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import igl.predicates
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from palpate.geometry.cloud import TriangleSurface
+from palpate.geometry.measures import enclosed_volume, triangle_normals
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.signedinteger]
+
+_MESHLAB, _BLENDER = "MeshLab: Filters > ", "Blender: in Edit Mode with all selected, Mesh > "
+_CLEANING = f"{_MESHLAB}Cleaning and Repairing > "
+_MERGE = f"{_CLEANING}Merge Close Vertices; {_BLENDER}Merge > By Distance"
+_CLOSE = (
+    f"{_MESHLAB}Remeshing, Simplification and Reconstruction > Close Holes; {_BLENDER}Clean Up > Fill Holes"
+)
+_FLAT = f"{_CLEANING}Remove T-Vertices; {_BLENDER}Clean Up > Degenerate Dissolve"
+_MANIFOLD = f"{_CLEANING}Repair non Manifold Edges, then Close Holes"
+_ORIENT = f"{_MESHLAB}Normals, Curvatures and Orientation > Re-Orient all faces coherently; {_BLENDER}Normals > Recalculate Outside"
+_TURN = f"{_MESHLAB}Normals, Curvatures and Orientation > Invert Faces Orientation; {_BLENDER}Normals > Flip"
+_ONE_PIECE = f"{_CLEANING}Remove Isolated pieces (wrt Face Num.); {_BLENDER}Separate > By Loose Parts, and export the body alone"
+_UNCROSS = (
+    f"{_MESHLAB}Selection > Select Self Intersecting Faces, delete them, then Close Holes; "
+    "Blender: the modifier Remesh with mode Voxel"
+)
+
+
+class SurfaceError(ValueError):
+    """A surface doesn't bound one body. The message has a line for each fault: how often, where first, what to do."""
+
+
+@dataclass(frozen=True)
+class Naming:
+    """How vertices, triangles and places of a surface are named to its author.
+
+    unit, unit_m  the file's unit and its length, m
+    vertices      (n_vertices,), number of each vertex in the file; None where the format has none
+    triangles     (n_triangles,), number of the face that each triangle is of; None: their indices
+    """
+
+    unit: str = "m"
+    unit_m: float = 1.0
+    vertices: Indices | None = None
+    triangles: Indices | None = None
+
+    def place(self, point: Array) -> str:
+        """A place in the file's unit, and in m where that is another one; point (3,) in m."""
+        here = _coordinates(point / self.unit_m, self.unit)
+        return here if self.unit == "m" else f"{here} = {_coordinates(point, 'm')}"
+
+    def edge(self, a: int, b: int) -> str:
+        return "" if self.vertices is None else f" from vertex {self.vertices[a]} to {self.vertices[b]}"
+
+    def triangle(self, t: int) -> str:
+        return str(t if self.triangles is None else self.triangles[t])
+
+
+def check_surface(surface: TriangleSurface, naming: Naming | None = None) -> None:
+    """Raise SurfaceError unless the surface bounds one solid body.
+
+    That is: not empty, no triangle without area, closed, manifold, consistently oriented, in one piece (so no cavities and
+    no separate bodies), free of self-intersections, and with its normals pointing outward. All that fail are named, each
+    in its line.
+    """
+    if naming is None:
+        naming = Naming(vertices=np.arange(len(surface.vertices)))
+    found = list(_faults(surface, naming)) if len(surface.triangles) else ["is empty: expected triangles"]
+    if found:
+        raise SurfaceError("\n".join(f"the surface {fault}" for fault in found))
+
+
+def _faults(surface: TriangleSurface, naming: Naming) -> Iterator[str]:
+    edges, counts, balance = _edges(surface.triangles)
+    n_open = int(np.sum(counts == 1))
+    if n_open > len(counts) / 2:
+        # Pieces and intersections would only repeat this.
+        yield (
+            f"is open: {n_open} of its {len(counts)} edges belong to one triangle only, so most triangles don't share "
+            f"vertices. To mend: {_MERGE}"
+        )
+        return
+    flat = _flat_triangles(surface)
+    if flat.any():
+        first = int(np.argmax(flat))
+        where = naming.place(surface.vertices[surface.triangles[first]].mean(axis=0))
+        yield (
+            f"is degenerate: {flat.sum()} triangles without area, the first is {naming.triangle(first)} near {where}. "
+            f"To mend: {_FLAT}"
+        )
+    uneven = (counts == 2) & (balance != 0)
+    for what, fault, description, advice in (
+        ("open", counts == 1, "edges with one triangle", _CLOSE),
+        ("not manifold", counts > 2, "edges with more than two triangles", _MANIFOLD),
+        ("not oriented consistently", uneven, "edges that both triangles run alike", _ORIENT),
+    ):
+        if fault.any():
+            a, b = edges[np.argmax(fault)]
+            where = naming.place(surface.vertices[[a, b]].mean(axis=0))
+            yield f"is {what}: {fault.sum()} {description}, the first{naming.edge(a, b)} near {where}. To mend: {advice}"
+    yield from _separate_pieces(surface, naming)
+    volume = enclosed_volume(surface)
+    if np.all(counts == 2) and not uneven.any() and volume <= 0:
+        yield (
+            f"is inside-out: it encloses {volume:.3g} m³, expected its triangles counter-clockwise seen from outside. "
+            f"To mend: {_TURN}"
+        )
+    yield from _crossings(surface, np.flatnonzero(~flat), naming)
+
+
+def _flat_triangles(surface: TriangleSurface) -> NDArray[np.bool_]:
+    """(n_triangles,): so flat, relative to the longest edge, that the normal is round-off."""
+    corners = surface.vertices[surface.triangles]
+    edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
+    _, areas = triangle_normals(surface)
+    return areas <= 1e-10 * edges**2
+
+
+def _edges(triangles: Indices) -> tuple[Indices, Indices, Indices]:
+    """Edges (n, 2), how many triangles have each (n,), and how many more run it upward than downward (n,)."""
+    directed = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    edges, which, counts = np.unique(
+        np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    upward = np.bincount(which.ravel(), directed[:, 0] < directed[:, 1], len(edges)).astype(np.int64)
+    return edges, counts, 2 * upward - counts
+
+
+def _separate_pieces(surface: TriangleSurface, naming: Naming) -> Iterator[str]:
+    triangles, n = surface.triangles, len(surface.vertices)
+    ends = np.concatenate([triangles[:, 1], triangles[:, 2]])
+    graph = coo_array((np.ones(len(ends)), (np.tile(triangles[:, 0], 2), ends)), (n, n))
+    _, label = connected_components(graph, directed=False)
+    pieces, sizes = np.unique(label[triangles[:, 0]], return_counts=True)
+    if len(pieces) > 1:
+        smallest = np.argmax(label[triangles[:, 0]] == pieces[np.argmin(sizes)])
+        where = naming.place(surface.vertices[triangles[smallest]].mean(axis=0))
+        yield (
+            f"has {len(pieces)} separate pieces, expected 1 (no cavities, no second body): the smallest has {sizes.min()} "
+            f"triangles near {where}. To mend: {_ONE_PIECE}"
+        )
+
+
+def _crossings(surface: TriangleSurface, solid: Indices, naming: Naming) -> Iterator[str]:
+    """The self-intersections among the triangles that have an area."""
+    triangles = surface.triangles[solid]
+    crossing, pairs, _ = igl.predicates.find_self_intersections(
+        np.ascontiguousarray(surface.vertices), np.ascontiguousarray(triangles, dtype=np.int64)
+    )
+    if crossing:
+        first, second = pairs[0]
+        where = naming.place(surface.vertices[triangles[first]].mean(axis=0))
+        yield (
+            f"intersects itself: {len(pairs)} pairs of triangles, the first are {naming.triangle(solid[first])} and "
+            f"{naming.triangle(solid[second])} near {where}. To mend: {_UNCROSS}"
+        )
+
+
+def _coordinates(point: Array, unit: str) -> str:
+    return "(" + ", ".join(f"{x:.6g}" for x in point) + f") {unit}"

@@ -1,0 +1,104 @@
+"""Numbers of a scene that look as if they were given in another unit: warnings, since unusual bodies exist."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from palpate.scene.schema import Config, SurfaceGeometry
+
+_SMALLEST_BODY_M, _LARGEST_BODY_M = 0.003, 1.0
+
+
+@dataclass(frozen=True)
+class _Usual:
+    """What is usual for a kind of number.
+
+    low, high    in `unit`
+    what         whose range this is
+    other_units  (name, length of it in `unit`), in which people give such numbers too
+    """
+
+    low: float
+    high: float
+    unit: str
+    what: str
+    other_units: tuple[tuple[str, float], ...] = ()
+
+
+_USUAL = {
+    "youngs_modulus_pa": _Usual(100, 1e9, "Pa", "tissue has", (("kPa", 1e3), ("MPa", 1e6))),
+    "density_kg_per_m3": _Usual(200, 3000, "kg/m³", "tissue has", (("g/cm³", 1e3),)),
+    "poissons_ratio": _Usual(0, 0.4999, "", "tissue has"),
+    "gamma": _Usual(1e-3, 20, "", "a branch of tissue has", (("percent", 0.01),)),
+    "tau_s": _Usual(1e-4, 100, "s", "what a touch can feel relaxes in", (("ms", 1e-3),)),
+    "radius_m": _Usual(1e-4, 0.5, "m", "organs and tool tips have", (("mm", 1e-3), ("cm", 1e-2))),
+    "spacing_m": _Usual(1e-4, 0.5, "m", "clouds of nodes have", (("mm", 1e-3), ("cm", 1e-2))),
+    "band_hz": _Usual(0, 100, "Hz", "force feedback has", (("rad/s", 1 / (2 * math.pi)),)),
+    "period_s": _Usual(2e-4, 5e-3, "s", "force feedback has", (("ms", 1e-3), ("µs", 1e-6))),
+    "tolerance": _Usual(1e-6, 0.2, "", "a usable model has", (("percent", 0.01),)),
+}
+_LENGTH_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+
+def plausibility(config: Config, size_m: float) -> tuple[str, ...]:
+    """A sentence for each number that is unusual: its key, its value, what is usual, what was probably meant.
+
+    size_m  largest extent of the body along an axis, m
+    """
+    return (*_size(config, size_m), *_numbers(config))
+
+
+def _size(config: Config, size_m: float) -> Iterator[str]:
+    if _SMALLEST_BODY_M <= size_m <= _LARGEST_BODY_M:
+        return
+    told = f"the body is {size_m:.3g} m across: usual are {_SMALLEST_BODY_M:g} to {_LARGEST_BODY_M:g} m"
+    geometry = config.geometry
+    if not isinstance(geometry, SurfaceGeometry):
+        yield f"geometry: {told}; lengths are in m, 5 mm is 0.005"
+        return
+    likely = [
+        f'"{unit}"'
+        for unit, length in _LENGTH_UNITS.items()
+        if _SMALLEST_BODY_M <= size_m * length / _LENGTH_UNITS[geometry.file_unit] <= _LARGEST_BODY_M
+    ]
+    advice = (
+        f"; probably meant: file_unit = {' or '.join(likely)}" if likely else "; check the unit of the file"
+    )
+    yield f'geometry.file_unit = "{geometry.file_unit}": {told}{advice}'
+
+
+def _numbers(config: Config) -> Iterator[str]:
+    material, reduction = config.material, config.reduction
+    # The constants of a preset are not the user's.
+    for key in ("youngs_modulus_pa", "density_kg_per_m3", "poissons_ratio"):
+        yield from _unusual(f"material.{key}", getattr(material, key))
+    for key in ("gamma", "tau_s"):
+        for value in getattr(material, key) or ():
+            yield from _unusual(f"material.{key}", value)
+    for key in ("radius_m", "spacing_m"):
+        yield from _unusual(f"geometry.{key}", getattr(config.geometry, key, None))
+    for contact in config.contact:
+        yield from _unusual(f"contact '{contact.name}'.radius_m", contact.radius_m)
+        yield from _unusual(f"contact '{contact.name}'.spacing_m", contact.spacing_m)
+    for index, region in enumerate(config.fixed):
+        yield from _unusual(f"fixed[{index}].radius_m", getattr(region, "radius_m", None))
+    yield from _unusual("reduction.band_hz", reduction.band_hz[1])
+    yield from _unusual("reduction.period_s", reduction.period_s)
+    yield from _unusual("reduction.tolerance", reduction.tolerance)
+
+
+def _unusual(key: str, value: float | None) -> Iterator[str]:
+    """The warning about a number, if it is given and unusual."""
+    usual = _USUAL[key.rsplit(".", 1)[1]]
+    if value is None or usual.low <= value <= usual.high:
+        return
+    meant = [
+        f"{value * length:.3g} if it was in {name}"
+        for name, length in usual.other_units
+        if usual.low <= value * length <= usual.high
+    ]
+    unit = f" {usual.unit}" if usual.unit else ""
+    advice = f"; probably meant: {', '.join(meant)}" if meant else "; check its unit"
+    yield f"{key} = {value:g}{unit}: {usual.what} {usual.low:g} to {usual.high:g}{unit}{advice}"

@@ -1,0 +1,174 @@
+"""Dialects of STL, OBJ and PLY that real programs write, each holding the same tetrahedron; and what damaged files get."""
+
+from __future__ import annotations
+
+import random
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.geometry.readers import READERS, Polygons, ReadError, read_polygons
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+
+
+def ascii_stl(name: str = "organ", end: str = "endsolid") -> str:
+    lines = [f"solid {name}"]
+    for face in FACES:
+        lines += ["  facet normal 0 0 nan", "    outer loop"]
+        lines += ["      vertex {:e} {:e} {:e}".format(*CORNERS[c]) for c in face]
+        lines += ["    endloop", "  endfacet"]
+    return "\n".join([*lines, end, ""])
+
+
+def binary_stl(header: bytes = b"made by a scanner") -> bytes:
+    records = b"".join(
+        struct.pack("<12fH", 0, 0, 0, *CORNERS[face].ravel(), 0xFFFF) for face in FACES.tolist()
+    )
+    return header.ljust(80, b"\0") + struct.pack("<I", len(FACES)) + records
+
+
+def ply_header(format_: str, vertex: str = "", face: str = "property list uchar int vertex_indices") -> str:
+    return (
+        f"ply\nformat {format_} 1.0\ncomment é by hand\nobj_info x\nelement vertex 4\nproperty float x\nproperty float y\n"
+        f"property float z\n{vertex}element face 4\n{face}\nend_header\n"
+    )
+
+
+def ascii_ply(name: str = "vertex_indices") -> str:
+    rows = [" ".join(str(x) for x in p) for p in CORNERS] + ["3 {} {} {}".format(*f) for f in FACES]
+    header = ply_header("ascii", face=f"property list uchar int {name}")
+    return header + "\n".join(rows) + "\n"
+
+
+def binary_ply(order: str) -> bytes:
+    """With a color and a quality, a list before the indices and counts of another type, as scanners write them."""
+    name = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    header = ply_header(
+        name,
+        vertex="property uchar red\nproperty double quality\n",
+        face="property list uchar float texcoord\nproperty list int uint vertex_index\nproperty short label",
+    )
+    vertices = b"".join(struct.pack(order + "3fBd", *p, 7, 0.5) for p in CORNERS)
+    faces = b"".join(struct.pack(order + "B2fi3Ih", 2, 0.1, 0.2, 3, *f, -1) for f in FACES.tolist())
+    return header.encode("latin-1") + vertices + faces
+
+
+DIALECTS: dict[str, bytes] = {
+    "ascii.stl": ascii_stl().encode(),
+    "name in Latin-1.stl": ascii_stl("Stra\u00dfe").encode("latin-1"),
+    "name in UTF-8 with mark.stl": ascii_stl("Stra\u00dfe").encode("utf-8-sig"),
+    "no name.stl": ascii_stl("").encode(),
+    "no endsolid.stl": ascii_stl(end="").encode(),
+    "end solid.stl": ascii_stl(end="end solid").replace("endfacet", "end facet").encode(),
+    "capitals.stl": ascii_stl().upper().encode(),
+    "CRLF.stl": ascii_stl().replace("\n", "\r\n").encode(),
+    "CR.stl": ascii_stl().replace("\n", "\r").encode(),
+    "binary.stl": binary_stl(),
+    "binary, header begins with solid.stl": binary_stl(b"solid facet exported by a program\n"),
+    "two solids.stl": "\n".join(
+        [*ascii_stl().splitlines()[:15], "endsolid", "solid b", *ascii_stl().splitlines()[15:]]
+    ).encode(),
+    "plain.obj": (POINTS + "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n").encode(),
+    "negative.obj": (POINTS + "f -4 -2 -3\nf -4 -3 -1\nf -4 -1 -2\nf -3 -2 -1\n").encode(),
+    "textures and normals.obj": (
+        "mtllib a.mtl\no Liver\u00df\n" + POINTS + "vt 0 0\nvn 0 0 1\ng left\nusemtl red\ns off\n"
+        "f 1/1/1 3/1/1 2/1/1\nf 1//1 2//1 4//1\nf 1/1 4/1 3/1\nf 2 3 4\nl 1 2\np 1\n"
+    ).encode("latin-1"),
+    "continued lines, comments, CRLF.obj": (
+        "# Blender\n" + POINTS + "f 1 \\\n3 \\\n2 # first\nf 1 2 4\n\nf 1 4 3\n  f 2 3 4\n"
+    ).replace("\n", "\r\n").encode(),
+    "colors and weights.obj": (
+        b"v 0 0 0 1 0 0\nv 1 0 0 1.0\nv 0 1 0 0.5 0.5 0.5\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4"
+    ),
+    "faces before their vertices.obj": ("f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n" + POINTS).encode(),
+    "ascii.ply": ascii_ply().encode("latin-1"),
+    "vertex_index.ply": ascii_ply("vertex_index").encode("latin-1"),
+    "CRLF.ply": ascii_ply().replace("\n", "\r\n").encode("latin-1"),
+    "little endian.ply": binary_ply("<"),
+    "big endian.ply": binary_ply(">"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DIALECTS)
+def test_each_dialect_gives_the_same_faces(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(DIALECTS[name])
+    polygons = read_polygons(path)
+    np.testing.assert_array_equal(polygons.sizes, [3, 3, 3, 3])
+    np.testing.assert_array_equal(polygons.vertices[polygons.corners].reshape(4, 3, 3), CORNERS[FACES])
+    assert polygons.first == (0 if name.endswith("ply") else 1)
+    assert polygons.indexed == (not name.endswith("stl"))
+
+
+REFUSED: dict[str, tuple[bytes, str]] = {
+    "short.stl": (binary_stl()[:-20], "its header states 4 triangles, it holds 3"),
+    "long.stl": (binary_stl() + b"12345", "its header states 4 triangles, there is room for 4.1"),
+    "cut.stl": ("\n".join(ascii_stl().splitlines()[:19]).encode(), "truncated: line 19, .* triangle 3"),
+    "comma.stl": (ascii_stl().replace("1.0", "1,0").encode(), "line 5: '1,0.*' has a decimal comma: .*sed"),
+    "word.stl": (ascii_stl().replace("vertex 0.0", "vertex zero", 1).encode(), "line 4: .* is not a number"),
+    "infinite.stl": (ascii_stl().replace("vertex 0.000000e+00", "vertex inf", 1).encode(), "line 4: .* finite coordinate"),
+    "quads.stl": (
+        ascii_stl().replace("endloop", "vertex 1 1 1\nendloop", 1).encode(),
+        "line 9: a facet with 4 vertices",
+    ),
+    "utf16.stl": (ascii_stl().encode("utf-16"), "UTF-16"),
+    "beyond.obj": ((POINTS + "f 1 3 2\n\nf 1 2 9\n").encode(), "line 7: a face names vertex 9, .* 4 vertices"),
+    "zero.obj": ((POINTS + "f 0 1 2\n").encode(), "line 5: a face names vertex 0, expected from 1"),
+    "before.obj": ((POINTS + "f -5 1 2\n").encode(), "line 5: a face names vertex -5"),
+    "two.obj": ((POINTS + "f 1 2\n").encode(), "line 5: a face with 2 vertices"),
+    "flat.obj": (b"v 0 0\n", "line 1: a vertex with 2 coordinates"),
+    "fraction.obj": ((POINTS + "f 1 2 3.5\n").encode(), "line 5: '3.5' is not a whole number"),
+    "huge.obj": (b"v 0 0 1e300\n", "line 1: .* finite coordinate"),
+    "points.ply": (
+        b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n",
+        "no element 'face'",
+    ),
+    "short.ply": (ascii_ply().rsplit("3 1", 1)[0].encode("latin-1"), "states 4 of 'face', the file ends after 3"),
+    "long.ply": ((ascii_ply() + "3 0 1 2\n").encode("latin-1"), "line 20: more lines"),
+    "word.ply": (ascii_ply().replace("3 0 2 1", "3 0 2 x").encode("latin-1"), "line 16: 'x'"),
+    "count.ply": (ascii_ply().replace("3 0 2 1", "4 0 2 1").encode("latin-1"), "line 16: 4 numbers, expected 5"),
+    "beyond.ply": (ascii_ply().replace("3 0 2 1", "3 0 2 4").encode("latin-1"), "face 0 names vertex 4"),
+    "type.ply": (ascii_ply().replace("float y", "quad y").encode("latin-1"), "line 7: 'property quad y'"),
+    "binary.ply": (binary_ply(">")[:-3], "states 4 of 'face', the file ends after 3"),
+    "surplus.ply": (binary_ply("<") + b"xx", "2 bytes more"),
+    "liver.step": (b"ISO-10303-21;", r"expected a file that ends in \.stl, \.obj, \.ply"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_damaged_file_is_refused_with_the_line_or_the_count(tmp_path: Path, name: str) -> None:
+    data, message = REFUSED[name]
+    path = tmp_path / name
+    path.write_bytes(data)
+    with pytest.raises(ReadError, match=message):
+        read_polygons(path)
+
+
+@pytest.mark.parametrize("name", DIALECTS)
+def test_a_damaged_file_never_ends_in_another_error(name: str) -> None:
+    data, read = DIALECTS[name], READERS[Path(name).suffix]
+    noise = random.Random(name)
+    changed = [data[:cut] for cut in range(0, len(data), 3)]
+    for _ in range(300):
+        damaged = bytearray(data)
+        for _ in range(noise.choice((1, 4))):
+            damaged[noise.randrange(len(data))] = noise.randrange(256)
+        changed.append(bytes(damaged))
+    for case in changed:
+        try:
+            assert isinstance(read(case), Polygons)
+        except ReadError as error:
+            assert str(error)
+
+
+@pytest.mark.parametrize("name", ["binary.stl", "little endian.ply", "big endian.ply"])
+def test_every_binary_file_that_is_cut_short_is_refused(name: str) -> None:
+    data, read = DIALECTS[name], READERS[Path(name).suffix]
+    for length in range(len(data)):
+        with pytest.raises(ReadError):
+            read(data[:length])
