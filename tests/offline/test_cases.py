@@ -37,7 +37,7 @@ def build(scene: Path) -> subprocess.CompletedProcess[str]:
     command = [
         sys.executable,
         "-m",
-        "palpate.cli",
+        "palpate",
         "build",
         str(scene),
         "-o",
