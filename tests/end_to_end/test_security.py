@@ -285,6 +285,30 @@ def test_nobody_hears_an_observer(connect_as: Callable[..., Any]) -> None:
 
 
 @pytest.mark.usefixtures("server")
+def test_an_observer_that_declares_thousands_of_keys_costs_an_operator_nothing(
+    connect_as: Callable[..., Any],
+) -> None:
+    with connect_as("operator") as operator, connect_as("observer") as observer:
+        assert operator.acquire("tip")[0]
+        with operator.pressing({"tip": [0.0, 0.0, -0.001]}):
+            operator.force_when(lambda force: force["force_scale"][0] == 1, "the force in full")
+            before = operator.next_status()
+            declared = [
+                observer.session.declare_subscriber(f"palpate/x{i}/force", lambda sample: None)
+                for i in range(2000)
+            ]
+            tokens = [
+                observer.session.liveliness().declare_token(f"palpate/main/client/x{i}") for i in range(2000)
+            ]
+            assert observer.query("describe")[0]  # behind the declarations, on the same link
+            after = operator.next_status()
+        assert len(declared) == len(tokens) == 2000
+        assert after["tools"]["tip"]["holder"] == "operator"
+        assert after["dropped"]["unsent_force"] == before["dropped"]["unsent_force"]
+        assert after["skipped_ticks"] == before["skipped_ticks"]
+
+
+@pytest.mark.usefixtures("server")
 def test_an_observer_cannot_keep_an_operators_lease(connect_as: Callable[..., Any]) -> None:
     def holder(status: dict[str, Any]) -> object:
         return status["tools"]["tip"]["holder"]
