@@ -153,7 +153,7 @@ def test_a_mistake_ends_in_one_plain_message_and_exit_code_2(
         ("point_m = [0.03, 0.03, 0.03]", "point_m = [0.03, 0.03, 0.93]", "contact 'tip': point_m = [0.03, 0.03, 0.93] is 0.9 m"),
         ("radius_m = 0.011", "radius_m = 10.0", "contact 'tip': radius_m = 10 holds"),
         ("point_m = [0.03, 0.03, 0.03]", "point_m = [0.03, 0.03, 0.0]", "contact 'tip' and a fixed region share node"),
-        ("normal = [0.0, 0.0, -1.0]", "normal = [0.0, 0.0, 0.0]", "fixed[0]: "),
+        ("normal = [0.0, 0.0, -1.0]", "normal = [0.0, 0.0, 0.0]", "fixed[0].normal = [0.0, 0.0, 0.0]"),
         ("counts = [7, 7, 4]\njitter = 0.1", "counts = [30, 30, 30]", "GiB"),
     ],
 )  # fmt: skip

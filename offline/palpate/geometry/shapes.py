@@ -52,22 +52,8 @@ def box_lattice(
         volumes = tributary_measures(points, *_midpoints(low, high, _SAMPLES_A_SPACING * (n - 1)))
     else:
         volumes = np.prod(np.where(on_lower | on_upper, 0.5, 1.0) * step, axis=1)
-
-    face_areas = np.zeros((len(points), 6))
-    for face in range(6):
-        members = faces[:, face]
-        axis = face // 2
-        if jitter:
-            flat_low, flat_high, cells = low.copy(), high.copy(), _SAMPLES_A_SPACING * (n - 1)
-            flat_low[axis] = flat_high[axis] = (low, high)[face % 2][axis]
-            cells[axis] = 1
-            face_areas[members, face] = tributary_measures(
-                points[members], *_midpoints(flat_low, flat_high, cells)
-            )
-        else:
-            weights = np.where(on_lower | on_upper, 0.5, 1.0) * step
-            face_areas[members, face] = np.prod(np.delete(weights[members], axis, axis=1), axis=1)
-
+    weights = None if jitter else np.where(on_lower | on_upper, 0.5, 1.0) * step
+    face_areas = _face_areas(points, faces, weights, (low, high), _SAMPLES_A_SPACING * (n - 1))
     outward = np.repeat(np.eye(3), 2, axis=0) * np.tile([-1.0, 1.0], 3)[:, None]  # (6, 3)
     normals = face_areas @ outward
     boundary = faces.any(axis=1)
@@ -82,6 +68,30 @@ def box_lattice(
         spacing=np.full(len(points), step.max()),
         surface=_lattice_surface(points, n),
     )
+
+
+def _face_areas(
+    points: Array,
+    faces: NDArray[np.bool_],
+    weights: Array | None,
+    corners: tuple[Array, Array],
+    cells: NDArray[np.int64],
+) -> Array:
+    """(n_nodes, 6), m²: the part of each face of the box (x-, x+, y-, ...) that each node stands for.
+
+    By the trapezoid rule's weights (n_nodes, 3), m, if given; else by the nearest node, in samples of `cells` an axis.
+    """
+    areas = np.zeros((len(points), 6))
+    for face in range(6):
+        members, axis = faces[:, face], face // 2
+        if weights is not None:
+            areas[members, face] = np.prod(np.delete(weights[members], axis, axis=1), axis=1)
+            continue
+        low, high, fine = corners[0].copy(), corners[1].copy(), cells.copy()
+        low[axis] = high[axis] = corners[face % 2][axis]
+        fine[axis] = 1
+        areas[members, face] = tributary_measures(points[members], *_midpoints(low, high, fine))
+    return areas
 
 
 def ball(radius_m: float, spacing_m: float) -> NodeCloud:
