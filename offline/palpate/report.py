@@ -33,9 +33,15 @@ def accuracy_text(model: ReducedModel, verbose: bool = False) -> str:
 def advice(model: ReducedModel) -> list[str]:
     """What to change, a sentence each, where an error is notable; empty for a good model. Never what is in use."""
     accuracy, found = model.accuracy, []
-    if max(accuracy.error_in_band, accuracy.error_static) > NOTABLE_ERROR:
-        other = "" if model.method == "tbr-band" else " or use tbr-band"
-        found.append(f"Force: raise the order{other}. A model that always answers zero is wrong by 100 %.")
+    low, high = accuracy.band_hz
+    for error, where in (
+        (accuracy.error_in_band, f"in {low:g}-{high:g} Hz"),
+        (accuracy.error_static, "at rest"),
+    ):
+        if error > NOTABLE_ERROR:
+            other = "" if model.method == "tbr-band" else " or use tbr-band"
+            zero = " A model that always answers zero is wrong by 100 %." if error > 1 else ""
+            found.append(f"Force {where}: wrong by {percent(error)}; raise the order{other}.{zero}")
     if accuracy.error_step > max(NOTABLE_ERROR, 2 * accuracy.error_static):
         found.append(
             "After a jump: the body rings near half the sampling rate; give the material a branch of short tau_s."

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from palpate.reduction.accuracy import (
     refuse_meaningless,
     step_error,
     time_domain_error,
-    warnings,
 )
 from palpate.reduction.gramians import real_form
 from palpate.reduction.passivity import largest_energy_out, passive_up_to, passivity_margin
@@ -299,37 +297,3 @@ def test_a_model_whose_force_is_round_off_is_refused(field, error):
     with pytest.raises(ReductionError, match=r"force is wrong by .* %.*expected at most 10000 %") as refusal:
         refuse_meaningless(report_with(**{field: error}), "tbr-band")
     assert "tbr-band" not in str(refusal.value)  # advice never names what is in use
-
-
-def test_a_model_is_warned_about_with_the_number_and_what_to_do(full):
-    reduction = reduce(full, "tbr-band", order=39)
-    blocks = to_block_form(reduction.system)
-
-    def told(method="tbr-band", **changes):
-        return warnings(
-            SimpleNamespace(
-                accuracy=report_with(**changes), method=method, continuous=blocks, order=blocks.order
-            )
-        )
-
-    padding = blocks.n_padding
-    assert padding == np.count_nonzero(~reduction.system.is_pair) % 2
-    assert len(told(error_in_band=0.09, error_static=0.09, error_step=0.09)) == padding
-    in_band = told("modal", error_in_band=0.43)[0]
-    assert "43 %" in in_band
-    assert "tbr-band" in in_band
-    assert "tbr-band" not in told(error_in_band=0.43)[0]
-    assert "143 % (a model that always answers zero" in told(error_in_band=1.43)[0]
-    assert "12 %" in told(error_static=0.12)[0]
-    assert "rings" in told(error_step=0.5)[0]
-
-
-def test_an_odd_number_of_real_poles_is_said_to_be_padded():
-    one = PoleResidueSystem(
-        np.array([-2.0 + 0j]), np.ones((1, 1)) + 0j, np.ones((1, 1)) + 0j, np.ones((1, 1))
-    )
-    blocks = to_block_form(one)
-    model = SimpleNamespace(accuracy=report_with(), method="tbr", continuous=blocks, order=blocks.order)
-    assert warnings(model) == (
-        "Order 1 is stored as 2: the form that runs has blocks of two states, and one is padding.",
-    )
