@@ -101,7 +101,7 @@ def draw(rows: Sequence[Row], title: str, band_hz: tuple[float, float], path: Pa
         ("error_static", "force error at 0 Hz"),
         ("error_hinf", "H-infinity error over the largest response"),
     )
-    styles = {"tbr": "o-", "tbr-band": "s-", "modal": "^--", "modal-static": "v--"}
+    styles = {"tbr": "o-", "tbr-band": "s-", "hankel-optimal": "d-.", "modal": "^--", "modal-static": "v--"}
     figure, axes = plt.subplots(1, 3, figsize=(14, 4.6), layout="constrained")
     for axis, (field, label) in zip(axes, panels, strict=True):
         for method in METHODS:
