@@ -19,7 +19,7 @@ from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.lti.sampling import sample, sampled_response
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.model_file import Contact, ReducedModel, StateSpace, Surface
-from palpate.modes.dense import elastic_modes
+from palpate.modes.dense import elastic_modes, require_memory
 from palpate.modes.elastic_modes import ElasticModes
 from palpate.progress import NO_PROGRESS, Progress
 from palpate.reduction.accuracy import measure, refuse_meaningless
@@ -107,6 +107,8 @@ def build_full_model(config: Config, folder: Path, progress: Progress = NO_PROGR
         f"{' + '.join(str(len(p.nodes)) for p in patches)} in contact"
     )
 
+    n_free = cloud.n_nodes - len(fixed) - sum(len(p.nodes) for p in patches)
+    require_memory(cloud.n_nodes, n_free, 3, symmetric=config.discretization.method == "conservative")
     progress(f"assembly, {config.discretization.method}")
     assemble = _ASSEMBLE[config.discretization.method]
     body = assemble(cloud, material, fixed, [p.nodes for p in patches], config.discretization.support_radius)
