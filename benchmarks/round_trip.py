@@ -25,6 +25,7 @@ from palpate_server.diagnostics.round_trips import (
     through_a_model,
 )
 from palpate_server.diagnostics.sample_model import spring_mass_model
+from palpate_server.realtime.records import PORT_RECORD
 
 
 def main() -> None:
@@ -40,7 +41,7 @@ def main() -> None:
         model = load_model(path)
         tool = model.contacts[0].name
         n = len(model.contacts)
-        force_bytes = len(wire.ForceEncoder(n).encode(0, 0, np.zeros((n, 4), np.int64), np.zeros((n, 8))))
+        force_bytes = len(wire.ForceEncoder(n).encode(0, 0, wire.as_words(np.zeros(n, PORT_RECORD))))
         command_bytes = len(encode_command(tool, 10**6, 10**15, (0.1, 0.2, 0.3)))
         print(
             f"order {model.order}, {n} tools; "

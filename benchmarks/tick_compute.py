@@ -37,11 +37,11 @@ STEPS = 1_000
 
 
 @njit(fastmath=True)
-def run_blocks(n, diagonal, cross, b_transposed, c, d, state, inputs, force):
+def run_blocks(n, body, inputs):
     for k in range(n):
         u = inputs[k % inputs.shape[0]]
-        state_space.output(c, d, state, u, force)
-        state_space.update(diagonal, cross, b_transposed, state, u)
+        state_space.output(body, u)
+        state_space.update(body, u)
 
 
 @njit
@@ -68,14 +68,18 @@ def run_reads(n, arrays):
 
 
 @njit
-def run_ticks(n, commands, image, start, period):
+def run_ticks(n, incoming, image, start, period):
+    tools = incoming.size
+    first = incoming[0].sequence + 1
     for k in range(n):
         now = start + k * period
-        depth = (0.0, 0.0, 1e-3 * (k % 64))
-        for contact in range(1, commands.lease.size):
-            scheduler.stage_command(commands, contact, k, 1, now, -1, 0, depth, (0.0, 0.0, 0.0))
-        scheduler.write_command(commands, 0, k, 1, now, -1, 0, depth, (0.0, 0.0, 0.0))
-        scheduler.repeat_tick(image, now)
+        for tool in range(tools):
+            command = incoming[tool]
+            command.tool = tool
+            command.sequence, command.arrival_ns = first + k, now
+            command.position_m[2] = 1e-3 * (k % 64)
+        scheduler.hand_over(image, tools)
+        scheduler.repeat_tick(image, now, now, False)
 
 
 def allocations(function: Callable[[], None]) -> int:
@@ -112,36 +116,36 @@ def row(order: int, contacts: int, runs: int) -> None:
     model = spring_mass_model(contacts, order // 2)
     system, channels = model.discrete, 3 * contacts
     inputs = np.random.default_rng(0).normal(size=(64, channels)) * 1e-3
-    blocks = shared_memory.make_model(system)
-    force = np.zeros(channels)
-    b, c, d = blocks.b_transposed, blocks.c, blocks.d
-    blocks_args = (blocks.diagonal, blocks.cross, b, c, d, blocks.state, inputs, force)
+    blocks = state_space.make_body(system)
     dense = [state_space.aligned(matrix) for matrix in (system.dense_a(), system.b, system.c, system.d)]
     dense_state, dense_force = state_space.aligned(np.zeros(order)), np.zeros(channels)
     scratch = (np.zeros(order), np.zeros(channels), np.zeros(order))
     dense_args = (*dense, dense_state, inputs, dense_force, *scratch)
-    run_blocks(1000, *blocks_args)
+    run_blocks(1000, blocks, inputs)
     run_blas(1000, *dense_args)
     np.testing.assert_allclose(blocks.state, dense_state, atol=1e-9 * np.abs(dense_state).max())
-    np.testing.assert_allclose(force, dense_force, atol=1e-9 * np.abs(dense_force).max())
-    matrices = tuple(state_space.aligned(matrix.ravel()) for matrix in (b, c, d))
+    np.testing.assert_allclose(blocks.force, dense_force, atol=1e-9 * np.abs(dense_force).max())
+    matrices = tuple(
+        state_space.aligned(matrix.ravel()) for matrix in (blocks.b_transposed, blocks.c, blocks.d)
+    )
     run_reads(1, matrices)
 
     limits = Limits(10.0, 2000.0, 1.0, 0.1, 4.0)
     memory = shared_memory.make_memory(system, model.period_s, [limits] * contacts, 1 / 30)
-    ticks_args = (memory.commands, make_image(memory), time.monotonic_ns(), int(memory.period_ns[0]))
+    ticks_args = (memory.commands.incoming, make_image(memory), time.monotonic_ns(), int(memory.period_ns[0]))
     run_ticks(1, *ticks_args)
     entry, ticks = (allocations(lambda n=n: run_ticks(n, *ticks_args)) for n in (0, STEPS))
     encoder = wire.ForceEncoder(contacts)
+    ports = wire.as_words(memory.ring.ports)[0]
 
     def encode() -> None:
         for k in range(STEPS):
-            encoder.encode(k, k, memory.record_inputs[0], memory.record_motion[0])
+            encoder.encode(k, k, ports)
 
     reading, stepping, blas, tick, encoding = best_in_turns(
         runs,
         lambda: run_reads(STEPS, matrices),
-        lambda: run_blocks(STEPS, *blocks_args),
+        lambda: run_blocks(STEPS, blocks, inputs),
         lambda: run_blas(STEPS, *dense_args),
         lambda: run_ticks(STEPS, *ticks_args),
         encode,

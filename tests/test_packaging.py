@@ -91,7 +91,7 @@ def test_a_client_runs_without_numpy() -> None:
         (["inspect", "model.npz"], "numpy", "server"),
         (["serve", "model.npz"], "numba", "server"),
         (["check-host"], "numba", "server"),
-        (["record", "out.mcap"], "mcap", "recorder"),
+        (["record", "out.mcap"], "zenoh", ""),
         (["replay", "in.mcap", "model.npz"], "mcap", "recorder"),
         (["demo"], "scipy", "all"),
         (["reproduce"], "scipy", "experiments"),

@@ -115,6 +115,7 @@ NOT_GRANTED = (
     "no_recordings",
     "bad_file",
     "exists",
+    "full",
     "not_recording",
     "internal",
 )

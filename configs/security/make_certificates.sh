@@ -1,6 +1,6 @@
 #!/bin/sh
 # A certificate authority of one's own, and certificates from it: for the server, and for the three clients that
-# server.json5 knows by name, `operator` (moves tools), `observer` (listens only) and `recorder` (listens, to commands too).
+# server.json5 knows by name, `operator` (moves tools), `observer` (listens only) and `recorder` (listens, and has the server record).
 #
 #   sh make_certificates.sh [FOLDER [NAME...]]          (default: certificates server operator observer recorder)
 #

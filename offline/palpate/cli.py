@@ -31,7 +31,7 @@ COMMANDS = {
     "check-host": Command(_SERVE, "measure whether this machine holds 1 kHz, and what to change", "server", "palpate_server.diagnostics.check_host"),
     "health": Command(_SERVE, "say whether a server is there and its loop runs", "", "palpate_client.health"),
     "client": Command(_TOUCH, "poke a running server and check every answer", "", "palpate_client.poke"),
-    "record": Command(_WATCH, "record a running server's commands, forces and status to an MCAP file", "recorder", "palpate_server.recording.record"),
+    "record": Command(_WATCH, "have a running server record its session to an MCAP file", "", "palpate_server.recording.record"),
     "replay": Command(_WATCH, "repeat a recording offline and compare bit for bit", "recorder", "palpate_server.recording.replay"),
     "reproduce": Command("The paper", "regenerate the figures of BaniHani & De 2009", "experiments", "palpate.commands", "reproduce"),
 }  # fmt: skip

@@ -23,7 +23,13 @@ from palpate_server.arguments import index, need, positive
 from palpate_server.realtime.safety import Limits, least_force_rate
 from palpate_server.session import log_limit, transport
 from palpate_server.session.loading import accuracy_warnings
-from palpate_server.session.server import FASTEST_SURFACE_HZ, USUAL_SURFACE_HZ, ServerOptions, serve
+from palpate_server.session.server import (
+    FASTEST_SURFACE_HZ,
+    USUAL_RECORDINGS_BYTES,
+    USUAL_SURFACE_HZ,
+    ServerOptions,
+    serve,
+)
 
 log = logging.getLogger("palpate_server")
 
@@ -83,7 +89,13 @@ def _server_options(options: argparse.Namespace) -> ServerOptions:
         need("mcap", "recorder", "palpate serve --recordings")
         _prepare_folder("--recordings", options.recordings)
     return ServerOptions(
-        limits, models, options.recordings, options.black_box, options.surface_hz, options.cpu
+        limits,
+        models,
+        options.recordings,
+        round(options.max_recordings_gb * 1e9),
+        options.black_box,
+        options.surface_hz,
+        options.cpu,
     )
 
 
@@ -145,6 +157,13 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FOLDER",
         help="where clients may have the session recorded to (extra `recorder`; default: they may not)",
+    )
+    parser.add_argument(
+        "--max-recordings-gb",
+        type=positive,
+        default=USUAL_RECORDINGS_BYTES / 1e9,
+        metavar="GB",
+        help="what the folder of recordings may hold (default: %(default)s)",
     )
     parser.add_argument(
         "--surface-hz",

@@ -25,8 +25,7 @@ from palpate_client.wire import (
     unpack_map,
 )
 from palpate_server.realtime.compiled import compiled
-
-MAX_RECORDED_BYTES = 2**20  # the largest message that goes into a recording
+from palpate_server.realtime.records import PORT_RECORD
 
 Vector = tuple[float, float, float]
 STILL: Vector = (0.0, 0.0, 0.0)
@@ -108,6 +107,7 @@ def _vectors(field: str, value: object) -> dict[str, Vector]:
     return vectors
 
 
+_WORD = {name: offset // 8 for name, (_, offset, *_) in (PORT_RECORD.fields or {}).items()}
 _MARKERS = {int: b"\xd3", float: b"\xcb"}  # msgpack's for int64 and float64
 _ONE, _THREE = 9, 28  # bytes of a number, of an array of three
 
@@ -122,50 +122,51 @@ class ForceEncoder:
         packer = msgpack.Packer()
         template = bytearray(packer.pack_map_header(1 + len(FORCE_FIELDS)))
         template += packer.pack("kind") + packer.pack(Kind.FORCE.value)
-        self._places = np.zeros(len(FORCE_FIELDS), np.int64)
+        self._layout = np.zeros((len(FORCE_FIELDS), 3), np.int64)
         for i, (name, (numbers, number_type)) in enumerate(FORCE_FIELDS.items()):
             template += packer.pack(name)
             one = _MARKERS[number_type] + bytes(8)
             if numbers != PER_TICK:
                 template += packer.pack_array_header(n_tools)
-            self._places[i] = len(template)
+            word = 0 if numbers == PER_TICK else _WORD[name]
+            self._layout[i] = len(template), numbers, word
             item = packer.pack_array_header(3) + 3 * one if numbers == 3 else one
             template += item * (1 if numbers == PER_TICK else n_tools)
         self._message = np.frombuffer(bytes(template), np.uint8).copy()
 
-    def encode(
-        self, tick: int, server_time_ns: int, inputs: NDArray[np.int64], motion: NDArray[np.float64]
-    ) -> bytes:
-        """One tick's answer; rows run over the tools in the order of the describe reply.
-
-        inputs  (n_tools, 4): sequence, client_time_ns, age_ns (all -1 without a command), flags
-        motion  (n_tools, 8): position x y z (m), force x y z (N), force scale, energy (J)
-        """
-        _fill_force(self._message, self._places, tick, server_time_ns, inputs, motion)
+    def encode(self, tick: int, server_time_ns: int, ports: NDArray[np.int64]) -> bytes:
+        """One tick's answer; ports (n_tools, words), of `as_words`, in the order of the describe reply."""
+        _fill_force(self._message, self._layout, tick, server_time_ns, ports)
         return self._message.tobytes()
+
+
+def as_words(ports: NDArray[np.void]) -> NDArray[np.int64]:
+    """Port records (..., n_tools) PORT_RECORD as words of 8 bytes, (..., n_tools, words), in the same memory."""
+    return ports.view(np.int64).reshape(*ports.shape, -1)
 
 
 @compiled
 def _fill_force(
     message: NDArray[np.uint8],
-    places: NDArray[np.int64],
+    layout: NDArray[np.int64],
     tick: int,
     server_time_ns: int,
-    inputs: NDArray[np.int64],
-    motion: NDArray[np.float64],
+    ports: NDArray[np.int64],
 ) -> None:
-    """Write a tick's numbers, big-endian, behind their markers in the message."""
-    _write(message, places[0], tick)
-    _write(message, places[1], server_time_ns)
-    bits = motion.view(np.int64)
-    for tool in range(inputs.shape[0]):
-        for column in range(4):
-            _write(message, places[2 + column] + _ONE * tool, inputs[tool, column])
-        for axis in range(3):
-            _write(message, places[6] + _THREE * tool + 1 + _ONE * axis, bits[tool, axis])
-            _write(message, places[7] + _THREE * tool + 1 + _ONE * axis, bits[tool, 3 + axis])
-        _write(message, places[8] + _ONE * tool, bits[tool, 6])
-        _write(message, places[9] + _ONE * tool, bits[tool, 7])
+    """Write a tick's numbers, big-endian, behind their markers in the message.
+
+    layout (fields, 3): a field's place in the message, how many numbers it has a tool, its first word in a port's record
+    """
+    _write(message, layout[0, 0], tick)
+    _write(message, layout[1, 0], server_time_ns)
+    for field in range(2, layout.shape[0]):
+        place, numbers, word = layout[field]
+        for tool in range(ports.shape[0]):
+            if numbers == 3:
+                for axis in range(3):
+                    _write(message, place + _THREE * tool + 1 + _ONE * axis, ports[tool, word + axis])
+            else:
+                _write(message, place + _ONE * tool, ports[tool, word])
 
 
 @compiled

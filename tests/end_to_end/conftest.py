@@ -26,8 +26,9 @@ import zenoh
 
 from palpate.model_file import ReducedModel, save_model
 from palpate_client.local_server import free_endpoint
-from palpate_client.wire import KEEP_ALIVES, LEASE_MS
+from palpate_client.wire import FORCE_FIELDS, KEEP_ALIVES, LEASE_MS
 from palpate_server.diagnostics.sample_model import spring_mass_model
+from palpate_server.recording.replay import read_recording
 
 EXAMPLES = Path(__file__).parents[2] / "client_examples"
 SESSION = "test"
@@ -373,6 +374,21 @@ def _configuration(place: str | Path) -> zenoh.Config:
     }.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+@pytest.fixture(scope="session")
+def forces_in() -> Callable[[Path], list[dict[str, Any]]]:
+    """The ticks of a recording as the force messages of the wire."""
+
+    def forces_in(path: Path) -> list[dict[str, Any]]:
+        recorded = read_recording(path)
+        return [
+            {"tick": int(tick["tick"]), "server_time_ns": int(tick["start_ns"])}
+            | {name: ports[name].tolist() for name in list(FORCE_FIELDS)[2:]}
+            for tick, ports in zip(recorded.ticks, recorded.ports, strict=True)
+        ]
+
+    return forces_in
 
 
 @pytest.fixture(scope="session")

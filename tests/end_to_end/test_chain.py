@@ -17,7 +17,6 @@ from palpate.lti.stepping import step_through
 from palpate.model_file import ReducedModel, load_model
 from palpate.plots import Touch
 from palpate_client.local_server import free_endpoint
-from palpate_server.recording.replay import read_session
 
 Array = NDArray[np.float64]
 
@@ -46,10 +45,11 @@ def poke(
     connect: Callable[..., Any],
     tmp_path_factory: pytest.TempPathFactory,
     slab_scene: Callable[..., str],
+    forces_in: Callable[..., Any],
 ) -> Poke:
     """A slab built, served in one process and poked at its second contact by the headless client in another."""
     folder = tmp_path_factory.mktemp("chain")
-    palpate = partial(start_for_module, "-m", "palpate.cli", cwd=folder)
+    palpate = partial(start_for_module, "-m", "palpate", cwd=folder)
     (folder / "slab.toml").write_text(
         slab_scene(("left", 0.02, 0.006), ("right", 0.05, 0.006), more="[reduction]\ntolerance = 0.02\n")
     )
@@ -68,7 +68,7 @@ def poke(
     assert server.stop() == 0
     with (folder / "poke.csv").open(newline="") as file:
         heard = list(csv.DictReader(file))
-    ticks = read_session(folder / "poke.mcap").forces
+    ticks = forces_in(folder / "poke.mcap")
     return Poke(load_model(folder / "slab.npz"), json.loads(out), heard, ticks)
 
 

@@ -26,17 +26,19 @@ def test_a_recording_that_exists_is_not_written_over(
 ) -> None:
     out = tmp_path / "earlier.mcap"
     out.write_bytes(b"an hour of work")
-    served = serve()
+    served = serve("--recordings", str(tmp_path))
     options = ("--session", "test", "--duration-s", "0.1", "--connect", served.endpoint)
-    assert_is_refused(start("-m", "palpate_server.recording.record", out, *options), "earlier.mcap exists")
+    for name, words in (
+        ("earlier.mcap", "earlier.mcap exists"),
+        ("a\n.mcap", "expected the name of a new file"),
+    ):
+        assert_is_refused(start("-m", "palpate_server.recording.record", name, *options), words)
     assert out.read_bytes() == b"an hour of work"
 
 
-def test_without_a_server_no_file_is_left_behind(start: Callable[..., Any], tmp_path: Path) -> None:
-    out = tmp_path / "new.mcap"
-    recorder = start("-m", "palpate_server.recording.record", out, "--connect", "tcp/127.0.0.1:1")
+def test_without_a_server_nothing_is_recorded(start: Callable[..., Any]) -> None:
+    recorder = start("-m", "palpate_server.recording.record", "new.mcap", "--connect", "tcp/127.0.0.1:1")
     assert_is_refused(recorder, "tcp/127.0.0.1:1")
-    assert not out.exists()
 
 
 def refusal(call: Callable[[list[str]], object], *options: str, capsys: pytest.CaptureFixture[str]) -> str:

@@ -12,14 +12,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import zenoh
-from mcap.reader import make_reader
 
 from palpate.model_file import save_model
 from palpate_client.local_server import free_endpoint
 from palpate_client.wire import Keys, pack
 from palpate_server.diagnostics.sample_model import spring_mass_model
+from palpate_server.recording.replay import read_recording
 
 EXAMPLE = Path(__file__).parents[2] / "configs" / "security"
 KEYS = Keys("main")
@@ -102,6 +103,7 @@ def with_a_second_operator(text: str) -> str:
 def serve_folder(start_for_module: Callable[..., Any]) -> Callable[[Path], None]:
     def serve_folder(folder: Path) -> None:
         options = (folder / "model.npz", "--zenoh-config", folder / "server.json5")
+        options += ("--recordings", folder / "recordings")
         start_for_module("-m", "palpate_server", *options, ready="serving")
 
     return serve_folder
@@ -190,7 +192,6 @@ def test_without_a_certificate_of_our_authority_nothing_is_read_and_nothing_move
     [
         ("observer", "observer"),
         ("observer", "operator"),
-        ("recorder", "recorder"),
         ("recorder", "operator"),
         ("operator", "other"),
     ],
@@ -252,18 +253,20 @@ def test_a_clients_certificate_is_not_taken_for_the_servers(
 
 
 @pytest.mark.usefixtures("server")
-def test_a_recorder_records_the_commands_of_an_operator(
-    folder: Path, tmp_path: Path, start: Callable[..., Any], run_client: Callable[..., Any]
+def test_a_recorder_has_the_server_record_and_may_do_nothing_else(
+    folder: Path,
+    start: Callable[..., Any],
+    run_client: Callable[..., Any],
+    connect_as: Callable[..., Any],
 ) -> None:
-    out = tmp_path / "session.mcap"
-    options = (out, "--zenoh-config", folder / "recorder.json5")
+    options = ("session.mcap", "--zenoh-config", folder / "recorder.json5", "--name", "recorder")
     recorder = start("-m", "palpate_server.recording.record", *options, ready="recording")
     code, _, err = run_client(folder, "operator").finish()
     assert code == 0, err
     assert recorder.stop() == 0
-    with out.open("rb") as stream:
-        topics = {channel.topic for _, channel, _ in make_reader(stream).iter_messages()}
-    assert KEYS.command("operator") in topics
+    assert np.any(read_recording(folder / "recordings" / "session.mcap").ports["force_n"])
+    with connect_as("recorder") as client, pytest.raises(TimeoutError):
+        client.acquire("tip")
 
 
 @pytest.mark.usefixtures("server")

@@ -29,7 +29,6 @@ from palpate.model_file import save_model
 from palpate_client.local_server import free_endpoint
 from palpate_client.wire import Flags
 from palpate_server.diagnostics.sample_model import spring_mass_model
-from palpate_server.recording.replay import read_session
 
 LIMITS_MET = int(
     Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED | Flags.SLEW_LIMITED | Flags.FORCE_CLAMPED | Flags.FAULT
@@ -51,7 +50,11 @@ def has_flag(flag: Flags) -> Callable[[dict[str, Any]], bool]:
 
 
 def test_forces_through_the_wire_are_the_tissues_answer_to_the_applied_positions(
-    serve: Callable[..., Any], connect: Callable[..., Any], run_example: Callable[..., Any], tmp_path: Path
+    serve: Callable[..., Any],
+    connect: Callable[..., Any],
+    run_example: Callable[..., Any],
+    tmp_path: Path,
+    forces_in: Callable[..., Any],
 ) -> None:
     """Forces are best effort. So what each tick applied is told by the server's recording, in which none is missing."""
     served = serve(
@@ -69,7 +72,7 @@ def test_forces_through_the_wire_are_the_tissues_answer_to_the_applied_positions
     assert summary["commands_answered"] > 0
     assert summary["round_trip_s"]["p50"] > 0
 
-    system, (first, *_) = served.model.discrete, (recorded := read_session(tmp_path / "ticks.mcap").forces)
+    system, (first, *_) = served.model.discrete, (recorded := forces_in(tmp_path / "ticks.mcap"))
     applied = np.array([tick["position_m"][0] for tick in recorded])
     assert not np.any(applied[0])  # recorded from before the first displacement: the model was at rest
     assert np.abs(applied).max() == pytest.approx(0.005, rel=1e-3)
@@ -125,7 +128,11 @@ def test_force_is_zero_within_a_tenth_of_a_second_after_the_client_is_killed(
 
 
 def test_a_client_that_pauses_for_half_a_second_is_faded_out_and_softly_in_again(
-    serve: Callable[..., Any], run_example: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+    serve: Callable[..., Any],
+    run_example: Callable[..., Any],
+    connect: Callable[..., Any],
+    tmp_path: Path,
+    forces_in: Callable[..., Any],
 ) -> None:
     served = serve("--recordings", str(tmp_path))
     slow = ("--duration-s", "60", "--frequency-hz", "0.5")
@@ -144,7 +151,7 @@ def test_a_client_that_pauses_for_half_a_second_is_faded_out_and_softly_in_again
     assert state["holder"] is not None  # half a second is no reason to lose the lease
     assert 0 < state["success_rate_since_start"] < 1
 
-    ticks = read_session(tmp_path / "pause.mcap").forces  # none is missing
+    ticks = forces_in(tmp_path / "pause.mcap")  # none is missing
     during = [tick for tick in ticks if stopped_ns <= tick["server_time_ns"] < resumed_ns]
     assert any(has_flag(Flags.HELD)(tick) for tick in during)
     assert any(has_flag(Flags.DECAYING)(tick) for tick in during)
@@ -763,5 +770,5 @@ def test_a_killed_client_leaves_a_black_box_behind(
         client.process.kill()
         (path,) = wait_for(lambda: list(folder.glob("*-lost.npz")), "a black box")
     with np.load(path, allow_pickle=False) as file:
-        assert np.any(file["force_n"])
-        assert not np.any(file["force_n"][-1])
+        assert np.any(file["ports"]["force_n"])
+        assert not np.any(file["ports"]["force_n"][-1])

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.model_file import ReducedModel
-from palpate_server import wire
 from palpate_server.diagnostics.round_trips import Trace
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
@@ -62,7 +61,7 @@ def press(
     limits = Limits(1e6, 1e12, 1e6, 1e3, max_damping_n_s_per_m)
     memory = shared_memory.make_memory(model.discrete, model.period_s, [limits] * len(model.contacts), 1.0)
     image = make_image(memory)
-    lease = int(memory.commands.lease[0])
+    incoming = memory.commands.incoming[0]
     propagators = handle.propagators(np.diff(trace.device_ns) * 1e-9).tolist()
     rendered, used = trace.rendered.tolist(), trace.used.tolist()
     server_ns, arrival_ns = trace.server_ns.tolist(), trace.arrival_ns.tolist()
@@ -77,12 +76,11 @@ def press(
             command = used[tick]
             if command >= 0:
                 told = rendered[command - 1] if command > 0 else -1
-                x, y, z = (depths[command] * inwards).tolist()
-                scheduler.write_command(
-                    memory.commands, 0, command, 0, arrival_ns[tick], told, lease, (x, y, z), wire.STILL
-                )
-            scheduler.repeat_tick(image, server_ns[tick])
-            forces.append(float(memory.device_force[0] @ inwards))
+                incoming["sequence"], incoming["arrival_ns"] = command, arrival_ns[tick]
+                incoming["rendered_tick"], incoming["position_m"] = told, depths[command] * inwards
+                scheduler.hand_over(image, 1)
+            scheduler.repeat_tick(image, server_ns[tick], server_ns[tick], False)
+            forces.append(-float(memory.ports["raw_force_n"][0] @ inwards))
         if k == len(propagators) or abs(position) > 1.0:
             break
         force = forces[rendered[k]] if position > 0 and rendered[k] >= 0 else 0.0

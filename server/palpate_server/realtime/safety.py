@@ -1,49 +1,30 @@
-"""What stands between a client's numbers and the model, and between the model and a hand: pure compiled functions.
+"""The safety chain as pure compiled functions, in the order in which a tick calls them for each port.
 
-Each tick and contact, in this order: reconstruction of the input between commands; its workspace and speed; its
-staleness and its jumps, which scale the force; passivity at the device's port; slew rate of the force; its magnitude. (That numbers
-are finite is checked before they come here.) Everything is in the frame of the client that holds the contact.
+Input between commands; workspace and speed; scale of the force, by staleness and jumps; passivity; rate of the force;
+its magnitude. Everything is in the frame of the client that holds the tool.
 """
 
 from __future__ import annotations
 
 import math
-from enum import IntFlag
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_client.wire import Flags
 from palpate_server.realtime.compiled import compiled
 
 Floats = NDArray[np.float64]
 
-HOLD_NS = 20_000_000  # so long a silent client's last displacement and force are held,
-DECAY_NS = 50_000_000  # then its force fades to zero in this time: dead after 70 ms,
-SOFT_START_NS = 200_000_000  # and comes back in this one.
-EXTRAPOLATE_NS = 5_000_000  # so far a command's velocity carries its displacement on.
-
-
-class Flags(IntFlag):
-    """What happened to one contact in one tick (LATE and CAUGHT_UP: to the tick)."""
-
-    HELD = 1  # no command came since the last tick; the displacement before was used again
-    DECAYING = 2  # the client has been silent for longer than HOLD_NS, or is gone: the force fades to zero
-    STALE = 4  # it has faded: the force is zero and the tip is withdrawn from the tissue
-    SOFT_START = 8  # commands are coming (again); the force fades in
-    WORKSPACE_CLAMPED = 16  # the displacement was longer than the workspace's radius
-    SPEED_LIMITED = 32  # the displacement moved faster than allowed and is followed at the allowed speed
-    SLEW_LIMITED = 64  # the force changed faster than allowed
-    FORCE_CLAMPED = 128  # the force was larger than allowed
-    FAULT = 256  # the model gave a force that is not finite; it was put back to rest
-    LATE = 512  # the tick began more than a quarter of a period after its deadline
-    CAUGHT_UP = 1024  # the tick was missed and made up for, together with a later one
-    PASSIVITY_LIMITED = 2048  # the port had given out energy; the force is damped to take it back
-    JUMPED = 4096  # farther than a tip can move while input is held: the force fades while it goes there, then in again
+HOLD_NS = 20_000_000  # the last position of a silent client is held for this time,
+DECAY_NS = 50_000_000  # then its force fades to zero in this time: gone after 70 ms.
+SOFT_START_NS = 200_000_000  # A force fades in over this time.
+EXTRAPOLATE_NS = 5_000_000  # The position moves on with the command's velocity for this time.
 
 
 class Limits(NamedTuple):
-    """Bounds for one contact; each above zero, but for the damping: with zero, passivity is observed and left alone."""
+    """Limits of one tool, each above zero; with a damping of zero, passivity is observed and not enforced."""
 
     max_force_n: float
     max_force_rate_n_per_s: float
@@ -53,7 +34,7 @@ class Limits(NamedTuple):
 
 
 def least_force_rate(max_force_n: float) -> float:
-    """N/s that any limit of the rate must allow, so that the largest force is gone when the fading is: in DECAY_NS."""
+    """The smallest limit of the rate, N/s, with which the largest force reaches zero within DECAY_NS."""
     return max_force_n * 1e9 / DECAY_NS
 
 
@@ -68,9 +49,9 @@ _JUMPED = int(Flags.JUMPED)
 
 @compiled
 def reconstruct(target: Floats, velocity: Floats, age_ns: int, position: Floats) -> None:
-    """Where the tip is `age_ns` after a command: carried on with its velocity for EXTRAPOLATE_NS, then held.
+    """Write the tip's position `age_ns` after a command: it moves with `velocity` for EXTRAPOLATE_NS, then is held.
 
-    target, velocity, position (3,), m and m/s. A velocity of zero is a hold from the start.
+    target, velocity, position (3,), m and m/s
     """
     seconds = min(max(age_ns, 0), EXTRAPOLATE_NS) * 1e-9
     for i in range(3):
@@ -84,21 +65,22 @@ def is_finite(value: float) -> bool:
 
 @compiled
 def follow(
-    target: Floats, applied: Floats, origin: Floats, workspace_radius: float, max_step: float, jump: float
+    target: Floats, applied: Floats, home: Floats, workspace_radius: float, max_step: float, jump: float
 ) -> int:
-    """Move `applied` (3,) towards `target` (3,), no further than `max_step` and not out of the workspace; flags.
+    """Move `applied` (3,) towards `target` (3,) by at most `max_step`, inside the workspace; the flags.
 
-    A way of more than `jump` is flagged as one. The workspace is a ball around `origin` (3,). `applied` is changed in place; it stays where it is when `target` has no finite length. All in m.
+    The workspace is a ball around `home` (3,). Sets JUMPED if the distance exceeds `jump`. `applied` is changed in place;
+    it stays when `target` is not finite. All in m.
     """
     flags = 0
-    x, y, z = target[0] - origin[0], target[1] - origin[1], target[2] - origin[2]
+    x, y, z = target[0] - home[0], target[1] - home[1], target[2] - home[2]
     length = math.sqrt(x * x + y * y + z * z)
     if not is_finite(length):
         return _WORKSPACE_CLAMPED
     wanted_x, wanted_y, wanted_z = target[0], target[1], target[2]
     if length > workspace_radius:
         inside = workspace_radius / length
-        wanted_x, wanted_y, wanted_z = origin[0] + x * inside, origin[1] + y * inside, origin[2] + z * inside
+        wanted_x, wanted_y, wanted_z = home[0] + x * inside, home[1] + y * inside, home[2] + z * inside
         flags |= _WORKSPACE_CLAMPED
     dx, dy, dz = wanted_x - applied[0], wanted_y - applied[1], wanted_z - applied[2]
     distance = math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -116,10 +98,7 @@ def follow(
 
 @compiled
 def fade(scale: float, live: bool, period_ns: int) -> float:
-    """The next force scale, in 0 to 1: rising over SOFT_START_NS while `live`, else falling over DECAY_NS.
-
-    A linear ramp either way, so neither silence nor coming back makes the force jump.
-    """
+    """The next force scale, 0 to 1: a linear ramp up over SOFT_START_NS while `live`, else down over DECAY_NS."""
     if live:
         return min(1.0, scale + period_ns / SOFT_START_NS)
     return max(0.0, scale - period_ns / DECAY_NS)
@@ -127,7 +106,7 @@ def fade(scale: float, live: bool, period_ns: int) -> float:
 
 @compiled
 def all_finite(values: Floats) -> bool:
-    """Whether every one of values (n,) is a finite number."""
+    """Whether all of values (n,) are finite."""
     for value in values:  # noqa: SIM110, numba has no all()
         if not math.isfinite(value):
             return False
@@ -140,27 +119,27 @@ def keep_passive(
 ) -> tuple[float, int]:
     """Time-domain passivity observer and controller (Hannaford & Ryu 2002); the energy so far (J), and flags.
 
-    `rendered` (3,) is the force the device held while it moved by `step` (3,): their product is the energy that the
-    port took in, exactly, because a device holds its force between updates. When more came out than went in, `force`
-    (3,) gets a damping that takes it back, no larger than `max_damping`.
+    `rendered` (3,) is the force on the device while it moved by `step` (3,). A device holds its force between updates, so
+    the port took in exactly -rendered · step. When more came out than went in, `force` (3,) gets a damping that takes
+    it back, at most `max_damping`.
     """
-    energy += rendered[0] * step[0] + rendered[1] * step[1] + rendered[2] * step[2]
+    energy -= rendered[0] * step[0] + rendered[1] * step[1] + rendered[2] * step[2]
     square = step[0] ** 2 + step[1] ** 2 + step[2] ** 2
     if energy >= 0.0 or square == 0.0 or max_damping == 0.0:
         return energy, 0
     damping = min(max_damping, -energy * period_s / square)
     for i in range(3):
-        force[i] += damping * step[i] / period_s
+        force[i] -= damping * step[i] / period_s
     return energy, _PASSIVITY_LIMITED
 
 
 @compiled
 def bound(force: Floats, previous: Floats, max_change: float, max_magnitude: float) -> int:
-    """Limit `force` (3,) in place: its change from `previous` (3,), then its magnitude, directions kept; flags.
+    """Limit `force` (3,) in place: its change from `previous` (3,), then its magnitude; the flags.
 
-    The rate always holds. With |previous| <= max_magnitude the magnitude holds too: cutting to a ball brings no two
-    points apart. A force above `max_magnitude`, because that was lowered, first comes down straight, as fast as the
-    rate allows; only what is left of the rate is for following. In N.
+    The limit of the change always holds. With |previous| <= max_magnitude the magnitude holds too: projecting on a ball
+    moves no two points apart. A previous force above `max_magnitude`, which was lowered, first decreases along its
+    direction as fast as allowed; only the rest of `max_change` is used to follow `force`. In N.
     """
     flags = 0
     before = math.sqrt(previous[0] ** 2 + previous[1] ** 2 + previous[2] ** 2)

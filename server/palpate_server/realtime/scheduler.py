@@ -1,4 +1,4 @@
-"""The tick: newest displacement in, one model step, force out, exactly once each period.
+"""When ticks run: exactly one step each period, on the arrival of a command or else at its deadline.
 
 Deadlines lie one period apart on the monotonic clock. A tick runs when a command arrives shortly before its deadline,
 so that the answer leaves at once; otherwise a compiled loop that never needs the GIL runs it at the deadline. Whoever
@@ -18,6 +18,9 @@ from typing import Any
 
 from numba import int32, types, uint64
 
+from palpate_client.wire import MAX_POSITION_M, MAX_VELOCITY_M_PER_S
+from palpate_server import coupling as couplings
+from palpate_server.realtime import safety
 from palpate_server.realtime.atomics import (
     MAX_READS,
     begin_read,
@@ -30,174 +33,173 @@ from palpate_server.realtime.atomics import (
 )
 from palpate_server.realtime.clock import monotonic_ns, sleep_until
 from palpate_server.realtime.compiled import compiled, compiled_without_gil
-from palpate_server.realtime.native_image import Image
+from palpate_server.realtime.native_image import Image, view
+from palpate_server.realtime.port import Record, has_faded
+from palpate_server.realtime.records import RECORDS, Change
 from palpate_server.realtime.shared_memory import (
-    ARRIVAL_NS,
-    AT_REST_SINCE,
     CHANGE,
     CHANGED_AT_TICK,
-    CHANGED_CONTACT,
-    CLIENT_TIME_NS,
+    CHANGED_PORT,
     DEADLINE_NS,
-    EXCHANGE,
-    FRAME,
     HEAD,
-    LEASE,
-    LIMITS,
     LOCK,
-    NEWEST,
-    NO_CHANGE,
-    QUIET_TICKS,
-    RENDERED_TICK,
-    RESET,
-    SEQUENCE,
-    SHIFTED_AT,
-    SKIPPED_TICKS,
-    STAGED,
     STOP,
     TAKEN,
-    TICKS,
-    TICKS_ON_ARRIVAL,
     TIMER_LATENESS,
     Commands,
     Floats,
     Integers,
     Memory,
-    view,
 )
-from palpate_server.realtime.tick import count, has_faded, put_to_rest, run_tick
+from palpate_server.realtime.tick import count, put_to_rest, run_tick
 
 MAX_CATCH_UP = 20
 _RETRY_NS = 20_000  # the deadline loop's nap while the other side runs the tick
 _PHASE_SHIFT_NS = 2_000  # the most that the deadlines move in a tick: 0.2 % of a millisecond
 _PHASE_GAIN = 16
 
+# Why a command is refused: results of `arrive`, indices into REFUSALS.
+REFUSALS = ("", "out_of_range", "not_finite", "old_sequence")
+_OUT_OF_RANGE, _NOT_FINITE, _OLD_SEQUENCE = -1, -2, -3
+
+_NO_CHANGE = int(Change.NONE)
+_LIMITS = int(Change.LIMITS)
+_FRAME = int(Change.FRAME)
+_RESET = int(Change.RESET)
+_EXCHANGE = int(Change.EXCHANGE)
+_SAVE = int(Change.SAVE)
+
 _eventfd_write: Any = types.ExternalFunction("eventfd_write", int32(int32, uint64))
 
 
 @compiled
-def stage_command(
-    commands: Commands,
-    contact: int,
-    sequence: int,
-    client_time_ns: int,
-    arrival_ns: int,
-    rendered_tick: int,
-    lease: int,
-    target: tuple[float, float, float],
-    velocity: tuple[float, float, float],
-) -> None:
-    """Have the displacement (m, finite) of a contact handed to the loop with the next `write_command`, in one act with it.
+def hand_over(image: Image, n_tools: int) -> int:
+    """Like `arrive`, but without a tick, for replays and tests; zero, or minus the reason's index."""
+    m = view(image)
+    refused = _check(m.commands, n_tools)
+    if not refused:
+        _hand_over(m.commands, n_tools)
+    return refused
 
-    One thread at a time may call this. lease: commands.lease[contact], read before it was checked whether the client holds
-    the contact
+
+@compiled
+def _check(commands: Commands, n_tools: int) -> int:
+    """Zero, or why a message is refused as a whole."""
+    worst = 0
+    for k in range(n_tools):
+        command = commands.incoming[k]
+        newest = commands.newest[command.tool]
+        if newest.lease == command.lease and command.sequence <= newest.sequence:
+            return _OLD_SEQUENCE
+        for vector, largest in (
+            (command.position_m, MAX_POSITION_M),
+            (command.velocity_m_per_s, MAX_VELOCITY_M_PER_S),
+        ):
+            if not safety.all_finite(vector):
+                worst = min(worst, _NOT_FINITE)
+            for j in range(3):
+                if abs(vector[j]) > largest:
+                    worst = min(worst, _OUT_OF_RANGE)
+    return worst
+
+
+@compiled
+def _hand_over(commands: Commands, n_tools: int) -> None:
+    """Put the incoming commands of one message where ticks find them: no tick comes in between."""
+    begin_write(commands.versions, 0)
+    for k in range(n_tools):
+        tool = commands.incoming[k].tool
+        commands.newest[tool] = commands.incoming[k]
+        commands.accepted[tool] += 1
+    end_write(commands.versions, 0)
+
+
+@compiled
+def forget_command(commands: Commands, tool: int) -> None:
+    """End the hold of a tool: its force fades from the next tick on, without being held first.
+
+    Commands that were checked for this hold and come later are discarded.
     """
-    integers, motion = commands.integers[STAGED, contact], commands.motion[STAGED, contact]
-    integers[SEQUENCE] = sequence
-    integers[CLIENT_TIME_NS] = client_time_ns
-    integers[ARRIVAL_NS] = arrival_ns
-    integers[RENDERED_TICK] = rendered_tick
-    integers[LEASE] = lease
+    begin_write(commands.versions, 0)
+    commands.lease[tool] += 1
+    commands.newest[tool].sequence = -1
+    end_write(commands.versions, 0)
+
+
+@compiled
+def is_silent(image: Image, tool: int) -> bool:
+    """Whether the force of a tool has faded to zero."""
+    return has_faded(view(image).ports[tool])
+
+
+# One thread at a time leaves a change in the slot and waits for it with `changed_at`.
+
+
+@compiled
+def set_limits(image: Image, tool: int, limits: Floats) -> None:
+    """Ask for other limits of a tool, (5,), the fields of safety.Limits."""
+    m = view(image)
+    settings = _prepare(m, tool)
+    settings.max_force_n = limits[0]
+    settings.max_force_rate_n_per_s = limits[1]
+    settings.max_speed_m_per_s = limits[2]
+    settings.workspace_radius_m = limits[3]
+    settings.max_damping_n_s_per_m = limits[4]
+    store_release(m.shared, CHANGE, _LIMITS)
+
+
+@compiled
+def set_frame(image: Image, tool: int, rotation: Floats, scale: float, home: Floats) -> None:
+    """Ask for another frame of a silent tool, and for its tip to be put to its start.
+
+    rotation (3, 3), home (3,), m: as in `frames`
+    """
+    m = view(image)
+    settings = _prepare(m, tool)
     for i in range(3):
-        motion[i] = target[i]
-        motion[3 + i] = velocity[i]
+        settings.home_m[i] = home[i]
+        for j in range(3):
+            settings.rotation[i, j] = rotation[i, j]
+    settings.scale = scale
+    store_release(m.shared, CHANGE, _FRAME)
 
 
 @compiled
-def write_command(
-    commands: Commands,
-    contact: int,
-    sequence: int,
-    client_time_ns: int,
-    arrival_ns: int,
-    rendered_tick: int,
-    lease: int,
-    target: tuple[float, float, float],
-    velocity: tuple[float, float, float],
-) -> None:
-    """Hand the newest displacement of a contact to the loop, and those that are staged: no tick comes in between."""
-    stage_command(
-        commands, contact, sequence, client_time_ns, arrival_ns, rendered_tick, lease, target, velocity
-    )
-    integers, motion = commands.integers, commands.motion
-    begin_write(commands.versions, 0)
-    for i in range(commands.lease.shape[0]):
-        if integers[STAGED, i, SEQUENCE] >= 0:
-            integers[NEWEST, i] = integers[STAGED, i]
-            motion[NEWEST, i] = motion[STAGED, i]
-            integers[STAGED, i, SEQUENCE] = -1
-    end_write(commands.versions, 0)
-
-
-@compiled
-def forget_command(commands: Commands, contact: int) -> None:
-    """The contact's client is gone: its force fades from the next tick on, without being held first.
-
-    Nor is what the client may still have sent, and nobody has looked at yet, carried out.
-    """
-    begin_write(commands.versions, 0)
-    commands.lease[contact] += 1
-    commands.integers[NEWEST, contact, SEQUENCE] = -1
-    end_write(commands.versions, 0)
-
-
-@compiled
-def is_silent(image: Image, contact: int) -> bool:
-    """True when the force of a contact has faded to zero."""
-    return has_faded(view(image), contact)
-
-
-# A change is left in the slot by one thread at a time, which then waits for it with `changed_at`.
-
-
-@compiled
-def set_limits(image: Image, contact: int, limits: Floats) -> None:
-    """Ask for other limits of a contact, (5,), the fields of safety.Limits."""
-    m = view(image)
-    m.changes.integers[CHANGED_CONTACT] = contact
-    m.changes.limits[:] = limits
-    store_release(m.shared, CHANGE, LIMITS)
-
-
-@compiled
-def set_frame(image: Image, contact: int, rotation: Floats, scale: float, origin: Floats) -> None:
-    """Ask for another frame of a silent contact, and for its tip to be put to rest: who comes next starts clean.
-
-    rotation (3, 3), origin (3,), m
-    """
-    m = view(image)
-    m.changes.integers[CHANGED_CONTACT] = contact
-    m.changes.rotation[:] = rotation
-    m.changes.scale[0] = scale
-    m.changes.origin[:] = origin
-    store_release(m.shared, CHANGE, FRAME)
+def _prepare(m: Memory, tool: int) -> Record:
+    """The slot's settings, which are those of the tool until they are changed."""
+    m.changes.integers[CHANGED_PORT] = tool
+    m.changes.settings[0] = m.settings[tool]
+    return m.changes.settings[0]
 
 
 @compiled
 def reset(image: Image) -> None:
-    """Ask for the model and all tips to be put to rest; every force fades in again.
+    """Ask for the body and all tips to be put to rest; every force fades in again.
 
     A force that a device is rendering is not forgotten: it comes down at the allowed rate.
     """
-    store_release(view(image).shared, CHANGE, RESET)
+    store_release(view(image).shared, CHANGE, _RESET)
 
 
 @compiled
 def exchange(image: Image, replacement: Image) -> None:
-    """Ask the loop to go on with another memory.
-
-    `replacement` is the image of the same memory with other `model`, `next_model`, `fade`, or snapshot arrays.
-    """
+    """Ask the loop to go on with another memory: the same one with another coupling."""
     m = view(image)
     m.changes.image[:] = replacement
-    store_release(m.shared, CHANGE, EXCHANGE)
+    store_release(m.shared, CHANGE, _EXCHANGE)
+
+
+@compiled
+def save(image: Image) -> None:
+    """Ask for the state to be saved."""
+    store_release(view(image).shared, CHANGE, _SAVE)
 
 
 @compiled
 def changed_at(image: Image) -> int:
     """The first tick after the change that was asked for, or -1 while none has carried it out."""
     m = view(image)
-    if load_acquire(m.shared, CHANGE) != NO_CHANGE:
+    if load_acquire(m.shared, CHANGE) != _NO_CHANGE:
         return -1
     return m.changes.integers[CHANGED_AT_TICK]
 
@@ -207,75 +209,102 @@ def withdraw_change(image: Image) -> bool:
     """Take the change out of the slot again; False when a tick has taken it up already."""
     m = view(image)
     kind = load_acquire(m.shared, CHANGE)
-    return kind > NO_CHANGE and compare_and_swap(m.shared, CHANGE, kind, NO_CHANGE)
+    return kind > _NO_CHANGE and compare_and_swap(m.shared, CHANGE, kind, _NO_CHANGE)
 
 
 @compiled
 def take_up_change(image: Image) -> None:
-    """Carry out what is in the slot. Called with the tick lock held, or in a replay; afterwards the image may be another."""
+    """Carry out what is in the slot, and save the state. Called with the tick lock held, or in a replay.
+
+    Afterwards the image may be another.
+    """
     m = view(image)
     kind = load_acquire(m.shared, CHANGE)
-    if kind == NO_CHANGE or not compare_and_swap(m.shared, CHANGE, kind, TAKEN):
+    if kind == _NO_CHANGE or not compare_and_swap(m.shared, CHANGE, kind, TAKEN):
         return
     changes = m.changes
-    contact = changes.integers[CHANGED_CONTACT]
-    if kind == LIMITS:
-        m.limits[contact] = changes.limits
-    elif kind == FRAME:
-        m.rotation[contact] = changes.rotation
-        m.frame_scale[contact] = changes.scale[0]
-        m.origin[contact] = changes.origin
-        m.device[contact] = changes.origin  # after a reset, though, it is where it was
-        put_to_rest(m, contact)
-    elif kind == RESET:
-        m.model.state[:] = 0.0
-        m.next_model.state[:] = 0.0
-        m.scale[:] = 0.0
-        for i in range(m.applied.shape[0]):
+    tool = changes.integers[CHANGED_PORT]
+    if kind == _LIMITS:
+        m.settings[tool] = changes.settings[0]
+    elif kind == _FRAME:
+        m.settings[tool] = changes.settings[0]
+        for j in range(3):
+            m.ports[tool].device_m[j] = m.settings[tool].home_m[
+                j
+            ]  # after a reset, though, it is where it was
+        put_to_rest(m, tool)
+    elif kind == _RESET:
+        couplings.put_to_rest(m.coupling)
+        for i in range(m.ports.shape[0]):
+            m.ports[i].force_scale = 0.0
             put_to_rest(m, i)
-    else:
-        m.counters[AT_REST_SINCE] = -1
-        m.counters[QUIET_TICKS] = 0
+    elif kind == _EXCHANGE:
+        m.counters[0].at_rest_since = -1
+        m.counters[0].quiet_ticks = 0
         image[:] = changes.image
-    changes.integers[CHANGED_AT_TICK] = m.counters[TICKS]
-    store_release(m.shared, CHANGE, NO_CHANGE)
+    _save(view(image))
+    tick = m.counters[0].ticks
+    m.ring.ticks[tick % RECORDS].change = kind
+    changes.integers[CHANGED_AT_TICK] = tick
+    store_release(m.shared, CHANGE, _NO_CHANGE)
 
 
 @compiled
-def repeat_tick(image: Image, start_ns: int) -> None:
-    """Run the next tick as if it began at `start_ns`: for replays, where no other thread is at work."""
+def _save(m: Memory) -> None:
+    m.saved.counters[0] = m.counters[0]
+    for i in range(m.ports.shape[0]):
+        m.saved.used[i] = m.used[i]
+        m.saved.settings[i] = m.settings[i]
+        m.saved.ports[i] = m.ports[i]
+    couplings.save(m.coupling, m.saved.state)
+
+
+@compiled
+def repeat_tick(image: Image, deadline_ns: int, start_ns: int, missed: bool) -> None:
+    """Run the next tick as `tick.run_tick`: for replays, where no other thread is at work."""
     take_up_change(image)
-    run_tick(view(image), start_ns, start_ns, False)
+    run_tick(view(image), deadline_ns, start_ns, missed)
 
 
 @compiled
-def tick_on_arrival(image: Image, arrival_ns: int) -> int:
-    """A command came at `arrival_ns`: run the tick if its deadline is near, and pull the deadlines towards it.
-
-    `image` is that of a Memory. Returns the number of ticks that ran.
-    """
+def _tick_on_arrival(image: Image, arrival_ns: int) -> int:
+    """A command came at `arrival_ns`: run the tick if its deadline is near, and pull the deadlines towards it."""
     m = view(image)
     if not compare_and_swap(m.shared, LOCK, 0, 1):
         return 0  # the deadline loop is at it; the command is in its slot for this tick or the next
+    counters = m.counters[0]
     period = m.period_ns[0]
     deadline = m.shared[DEADLINE_NS]
     half = period // 2
     error = (arrival_ns + period // 4 - deadline + half) % period - half
-    before = m.counters[TICKS]
-    if (
-        m.counters[SHIFTED_AT] != before
-    ):  # of a burst for one tick, the first counts: no client drags model time along
-        m.counters[SHIFTED_AT] = before
+    before = counters.ticks
+    if counters.shifted_at != before:  # of a burst for one tick, the first counts
+        counters.shifted_at = before
         deadline += min(max(error // _PHASE_GAIN, -_PHASE_SHIFT_NS), _PHASE_SHIFT_NS)
         store_release(m.shared, DEADLINE_NS, deadline)
     ticks = 0
     if arrival_ns >= deadline - period // 2:
         take_up_change(image)
         _run_due_ticks(view(image), arrival_ns)
-        ticks = m.counters[TICKS] - before
-        m.counters[TICKS_ON_ARRIVAL] += 1
+        ticks = counters.ticks - before
+        counters.ticks_on_arrival += 1
     store_release(m.shared, LOCK, 0)
     return ticks
+
+
+@compiled
+def arrive(image: Image, n_tools: int) -> int:
+    """Hand over the first `n_tools` of the incoming commands, which are one message, and run the tick if it is near.
+
+    The number of ticks that ran; or, below zero, minus the index of the reason in REFUSALS: then nothing is handed over.
+    One thread at a time may fill Commands.incoming and call this.
+    """
+    m = view(image)
+    result = _check(m.commands, n_tools)
+    if result == 0:
+        _hand_over(m.commands, n_tools)
+        result = _tick_on_arrival(image, m.commands.incoming[0].arrival_ns)
+    return result
 
 
 @compiled_without_gil
@@ -315,14 +344,17 @@ def records_written(shared: Integers) -> int:
 
 @compiled
 def read_snapshot(image: Image, state: Floats, displacement: Floats) -> int:
-    """Copy the last snapshot of the model into `state` (order,) and `displacement` (n_contacts, 3), m; its tick, or -1."""
+    """Copy the last snapshot into `state` (order,) of the body and `displacement` (n_tools, 3), m; its tick, or -1."""
     m = view(image)
     for _ in range(MAX_READS):
-        version = begin_read(m.snapshot_version, 0)
-        state[:] = m.snapshot_state
-        displacement[:] = m.snapshot_displacement
-        tick = m.snapshot_tick[0]
-        if is_whole(m.snapshot_version, 0, version):
+        version = begin_read(m.snapshot.versions, 0)
+        for i in range(state.shape[0]):
+            state[i] = m.snapshot.state[i]
+        for i in range(displacement.shape[0]):
+            for j in range(3):
+                displacement[i, j] = m.snapshot.displacement[i, j]
+        tick = m.snapshot.tick[0]
+        if is_whole(m.snapshot.versions, 0, version):
             return tick
     return -1
 
@@ -336,7 +368,7 @@ def _run_due_ticks(m: Memory, now: int) -> None:
     if now > deadline:
         due += (now - deadline) // period
     if due > MAX_CATCH_UP:
-        m.counters[SKIPPED_TICKS] += due - MAX_CATCH_UP
+        m.counters[0].skipped_ticks += due - MAX_CATCH_UP
         deadline += (due - MAX_CATCH_UP) * period
         due = MAX_CATCH_UP
     for i in range(due):

@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from palpate.files import write_atomically
-from palpate_server.realtime import scheduler, shared_memory
-from palpate_server.realtime.safety import Flags
+from palpate_client.wire import Flags
+from palpate_server.realtime import scheduler
+from palpate_server.realtime.records import RECORDS
+from palpate_server.realtime.shared_memory import Integers, Memory
 
 log = logging.getLogger("palpate_server")
 
@@ -35,17 +37,17 @@ _LIMITED = int(
 class BlackBox:
     """Looks at new ticks each time `examine` is called (some times a second) and writes a file when there is cause.
 
-    Causes: `fault` (a force that was not finite), `stale` (a client that holds a contact fell silent, and its force had to
-    fade to zero), `lost` (a client that held a contact was killed or cut off), `limits` (half of the last second's ticks met a limit). One file of each cause in QUIET_S; the writing is done by a thread of its own.
+    Causes: `fault` (a force was not finite), `stale` (a client that holds a tool fell silent, and its force had to fade to
+    zero), `lost` (a client that held a tool was killed or cut off), `limits` (half of the last second's ticks met a limit).
+    One file of each cause in QUIET_S. A file holds `tools`, their names, and the records of the ring: `ticks` (records.TICK)
+    and `ports` (records.PORT_RECORD).
     """
 
-    def __init__(
-        self, folder: Path, session: str, contacts: Sequence[str], memory: shared_memory.Memory
-    ) -> None:
+    def __init__(self, folder: Path, session: str, tools: Sequence[str], memory: Memory) -> None:
         self.folder = folder
         self.session = session
-        self.contacts = list(contacts)
-        self.memory = memory
+        self.tools = list(tools)
+        self.memory = memory  # its ring stays the same when the model is exchanged
         self._seen = 0
         self._lost_clients = self._lost_written = 0
         self._files = 0
@@ -54,7 +56,7 @@ class BlackBox:
     def examine(self, lost_clients: int = 0) -> threading.Thread | None:
         """The thread that writes a file, when there was cause for one. `lost_clients`: how many so far."""
         head = int(scheduler.records_written(self.memory.shared))
-        first = max(self._seen, head - shared_memory.RECORDS // 2, 0)
+        first = max(self._seen, head - RECORDS // 2, 0)
         cause = self._cause(first, head, lost_clients)
         self._seen = head
         now = time.monotonic()
@@ -84,48 +86,29 @@ class BlackBox:
             return None
         before = self._flags(first - 1, head - 1) if first else np.full_like(flags, int(Flags.STALE))
         became_stale = (flags & int(Flags.STALE) > 0) & (before & int(Flags.DECAYING) > 0)
-        if np.any(
-            became_stale & (self._column(shared_memory.SEQUENCE, first, head) >= 0)
-        ):  # not one that was released
+        if np.any(became_stale & (self._column("sequence", first, head) >= 0)):  # not one that was released
             return "stale"
         recent = self._flags(max(0, head - STORM_TICKS), head)
         if len(recent) == STORM_TICKS and np.mean(np.any(recent & _LIMITED, axis=1)) >= STORM_SHARE:
             return "limits"
         return None
 
-    def _flags(self, first: int, last: int) -> shared_memory.Integers:
-        return self._column(shared_memory.CONTACT_FLAGS, first, last)
+    def _flags(self, first: int, last: int) -> Integers:
+        return self._column("flags", first, last)
 
-    def _column(self, column: int, first: int, last: int) -> shared_memory.Integers:
-        """(ticks, n_contacts)"""
-        rows = np.arange(first, last) % shared_memory.RECORDS
-        return self.memory.record_inputs[rows, :, column]
+    def _column(self, name: str, first: int, last: int) -> Integers:
+        """(ticks, n_tools)"""
+        column: Integers = self.memory.ring.ports[name][np.arange(first, last) % RECORDS]
+        return column
 
     def _write(self, cause: str, head: int) -> None:
         ticks = np.arange(max(0, head - KEPT_TICKS), head)
-        rows = ticks % shared_memory.RECORDS
-        times = self.memory.record_times[rows]
-        inputs = self.memory.record_inputs[rows]
-        motion = self.memory.record_motion[rows]
+        rows = ticks % RECORDS
+        ring = self.memory.ring
         path = self.folder / f"palpate-{self.session}-tick{head}-{cause}.npz"
         try:
             buffer = io.BytesIO()
-            np.savez(
-                buffer,
-                tools=np.array(self.contacts),
-                tick=ticks,
-                server_time_ns=times[:, shared_memory.START_NS],
-                deadline_ns=times[:, shared_memory.TICK_DEADLINE_NS],
-                compute_time_ns=times[:, shared_memory.COMPUTE_NS],
-                sequence=inputs[:, :, shared_memory.SEQUENCE],
-                client_time_ns=inputs[:, :, shared_memory.CLIENT_TIME_NS],
-                input_age_ns=inputs[:, :, shared_memory.AGE_NS],
-                flags=inputs[:, :, shared_memory.CONTACT_FLAGS],
-                position_m=motion[:, :, 0:3],
-                force_n=motion[:, :, 3:6],
-                force_scale=motion[:, :, shared_memory.SCALE],
-                energy_j=motion[:, :, shared_memory.ENERGY_J],
-            )
+            np.savez(buffer, tools=np.array(self.tools), ticks=ring.ticks[rows], ports=ring.ports[rows])
             write_atomically(path, buffer.getvalue())
         except OSError as error:
             log.warning("black box %s could not be written: %s", path, error)

@@ -1,63 +1,110 @@
-"""The MCAP file of a session, each message as JSON with its schema; and a process that writes one from a pipe.
+"""The MCAP file of a recording, each message as JSON with its schema; and the process that writes one from a pipe.
 
-    python -m palpate_server.recording.mcap_file < MESSAGES > OUT.mcap
+    python -m palpate_server.recording.mcap_file MAX_BYTES < MESSAGES > OUT.mcap
 
-The server starts it for `control record`: MESSAGES are msgpack lists `[kind, key, time_ns, payload]`, one behind the other.
-The end of the pipe ends the file, also when the server was killed; nothing else does.
+MESSAGES are msgpack lists, one behind the other: `["message", kind, key, time_ns, payload]` with a msgpack map, and
+`["ticks", key, clock_offset_ns, ticks, ports]` with records.TICK and records.PORT_RECORD as they are in memory. The end of the
+pipe ends the file, also when the server was killed. To stderr the process writes a line each time it has written to the
+file: how many messages are in it; and last, what went wrong.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
 import os
 import signal
 import sys
-from typing import Any, BinaryIO
+from typing import Any
 
 import msgpack
+import numpy as np
 from mcap.writer import CompressionType, Writer
+
+from palpate_server.realtime.records import PORT_RECORD, TICK
+from palpate_server.recording.json_records import FULL, as_objects
 
 PROFILE = "palpate"
 _CHUNK_BYTES = 64 * 1024  # a crash loses no more than this
-_NUMBERS = {"type": "array", "items": {"type": "number"}}
-# Foxglove opens a topic when its arrays hold numbers or objects, and its objects say what is in them; arrays of arrays,
-# which the wire has, it refuses. So a force's vectors are written as x, y, z.
-_POINT = {"type": "object", "properties": {axis: {"type": "number"} for axis in "xyz"}}
-_POINTS = {"type": "array", "items": _POINT}
+_END_BYTES = 64 * 1024  # room for the last chunk and the summary
+_INTEGER, _NUMBER = {"type": "integer"}, {"type": "number"}
 _MAP: dict[str, Any] = {"type": "object", "properties": {}}
-_VECTORS_OF_A_FORCE = ("position_m", "force_n")
+# Foxglove opens a topic when its arrays hold numbers or objects, and its objects say what is in them; it refuses arrays of
+# arrays. So vectors are written as x, y, z.
+_POINT = {"type": "object", "properties": dict.fromkeys("xyz", _NUMBER)}
+
+
+def _properties(record: np.dtype[np.void]) -> dict[str, Any]:
+    """The JSON schema of a record's fields."""
+    kinds: dict[str, Any] = {}
+    for name in record.names or ():
+        field = record[name]
+        if field.shape == (3,):
+            kinds[name] = _POINT
+        elif field.shape:
+            kinds[name] = {"type": "array", "items": _NUMBER}
+        else:
+            kinds[name] = _INTEGER if field.kind == "i" else _NUMBER
+    return kinds
+
+
 _SCHEMAS: dict[str, dict[str, Any]] = {
-    "command": {
-        "sequence": {"type": "integer"},
-        "client_time_ns": {"type": "integer"},
-        "position_m": _MAP,
-        "velocity_m_per_s": _MAP,
-        "rendered_tick": {"type": "integer"},
+    "describe": {"session": {"type": "string"}, "period_s": _NUMBER},
+    "settings": {"tick": _INTEGER, "change": {"type": "string"}},
+    "status": {"state": {"type": "string"}, "ticks": _INTEGER},
+    "tick": _properties(TICK)
+    | {
+        "tools": {
+            "type": "array",
+            "items": {"type": "object", "properties": _properties(PORT_RECORD)},
+        }
     },
-    "force": {
-        "tick": {"type": "integer"},
-        "server_time_ns": {"type": "integer"},
-        "sequence": _NUMBERS,
-        "client_time_ns": _NUMBERS,
-        "input_age_ns": _NUMBERS,
-        "flags": _NUMBERS,
-        "position_m": _POINTS,
-        "force_n": _POINTS,
-        "force_scale": _NUMBERS,
-        "energy_j": _NUMBERS,
-    },
-    "status": {"state": {"type": "string"}, "ticks": {"type": "integer"}},
-    "describe": {"session": {"type": "string"}, "period_s": {"type": "number"}},
 }
 
 
-class Recording:
-    """An MCAP file that is being written; one channel a key, its schema named after the kind of message."""
+class _File:
+    """A file that keeps within a number of bytes."""
 
-    def __init__(self, stream: BinaryIO) -> None:
-        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.LZ4)
+    def __init__(self, descriptor: int, max_bytes: int) -> None:
+        self._file = io.FileIO(descriptor, "wb", closefd=False)
+        self._max_bytes = max_bytes
+        self.size = 0
+
+    def write(self, data: bytes) -> int:
+        """Raises OSError."""
+        if self.size + len(data) > self._max_bytes:
+            raise OSError(None, FULL)
+        view = memoryview(data)
+        while view:
+            view = view[self._file.write(view) or 0 :]
+        self.size += len(data)
+        return len(data)
+
+    def cut(self, size: int) -> None:
+        """Take away what stands behind `size` bytes."""
+        with contextlib.suppress(OSError):  # what is no plain file can't be cut
+            os.ftruncate(self._file.fileno(), size)
+
+    def tell(self) -> int:
+        return self.size
+
+    def flush(self) -> None:
+        pass
+
+
+class Recording:
+    """An MCAP file that is being written; one channel a key, its schema named after the kind of message.
+
+    messages: how many are in the file for good, in its first `end` bytes
+    """
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._writer = Writer(
+            file, chunk_size=_CHUNK_BYTES, compression=CompressionType.LZ4, enable_data_crcs=True
+        )
         self._writer.start(profile=PROFILE, library="palpate")
         self._schemas = {
             kind: self._writer.register_schema(
@@ -68,56 +115,68 @@ class Recording:
             for kind, properties in _SCHEMAS.items()
         }
         self._channels: dict[str, int] = {}
+        self._added = 0
         self.messages = 0
+        self.end = file.tell()
 
-    def add(self, kind: str, key: str, time_ns: int, payload: bytes) -> None:
-        """Write a message, msgpack; one that can't be read is left out (the server counts them). Raises OSError."""
-        data = _as_json(kind, payload)
-        if data is None:
-            return
+    def add(self, kind: str, key: str, time_ns: int, message: dict[str, Any]) -> None:
+        """Write a message. Raises OSError."""
         if key not in self._channels:
             self._channels[key] = self._writer.register_channel(
                 topic=key, message_encoding="json", schema_id=self._schemas[kind]
             )
+        size = self._file.tell()
+        data = json.dumps(_plain(message), allow_nan=False).encode()
         self._writer.add_message(self._channels[key], log_time=time_ns, data=data, publish_time=time_ns)
-        self.messages += 1
+        self._added += 1
+        if self._file.tell() > size:  # a chunk was written, this message its last
+            self.messages, self.end = self._added, self._file.tell()
+
+    def add_ticks(self, key: str, clock_offset_ns: int, ticks: bytes, ports: bytes) -> None:
+        """Write the ticks of a part of the ring. Raises OSError."""
+        tick_records = np.frombuffer(ticks, TICK)
+        tools = as_objects(np.frombuffer(ports, PORT_RECORD))
+        n_tools = len(tools) // max(1, len(tick_records))
+        for k, tick in enumerate(as_objects(tick_records)):
+            tick["tools"] = tools[k * n_tools : (k + 1) * n_tools]
+            self.add("tick", key, tick["start_ns"] + clock_offset_ns, tick)
 
     def finish(self) -> None:
         self._writer.finish()  # type: ignore[no-untyped-call]
-
-
-def from_json(kind: str, data: bytes) -> dict[str, Any]:
-    """A message as it was on the wire, from one of a recording."""
-    message: dict[str, Any] = json.loads(data)
-    if kind == "force":
-        for name in _VECTORS_OF_A_FORCE:
-            message[name] = [[point[axis] for axis in "xyz"] for point in message[name]]
-    return message
-
-
-def _as_json(kind: str, payload: bytes) -> bytes | None:
-    # A client's payload can be anything: what msgpack knows and JSON does not, nested without end.
-    try:
-        message = msgpack.unpackb(payload, raw=False, strict_map_key=True)
-        if type(message) is not dict:
-            return None
-        if kind == "force":
-            for name in _VECTORS_OF_A_FORCE:
-                message[name] = [dict(zip("xyz", vector, strict=True)) for vector in message[name]]
-        return json.dumps(_plain(message), allow_nan=False).encode()
-    except Exception:
-        return None
+        self.messages = self._added
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can hold: numbers that are not finite (in a command that was refused) become null."""
+    """What JSON can hold: numbers that are not finite become null."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list):
         return [_plain(item) for item in value]
-    if isinstance(value, bytes):
-        return value.hex()
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _tell(what: object) -> None:
+    """A line for the server, if it is still there."""
+    with contextlib.suppress(OSError):
+        print(what, file=sys.stderr, flush=True)
+
+
+def _write_all(recording: Recording, file: _File, max_bytes: int) -> str | None:
+    """Write what comes through the pipe until its end; why the recording has ended before, if it has."""
+    told = 0
+    # Unbuffered: a buffered one would wait for a megabyte, which is seconds of ticks.
+    for what, *parts in msgpack.Unpacker(io.FileIO(sys.stdin.fileno()), raw=False, max_buffer_size=2**28):
+        if what == "ticks":
+            recording.add_ticks(*parts)
+        else:
+            kind, key, time_ns, payload = parts
+            recording.add(kind, key, time_ns, msgpack.unpackb(payload))
+        if recording.messages > told:
+            told = recording.messages
+            _tell(told)
+        if file.size > max_bytes - 2 * _CHUNK_BYTES - _END_BYTES:
+            return FULL
+    return None
 
 
 def main() -> int:
@@ -126,16 +185,22 @@ def main() -> int:
         signal.signal(number, signal.SIG_IGN)
     # The server comes first. At 10, a busy machine would leave less than a thousand ticks a second need: some percent.
     os.nice(5)
-    stream = sys.stdout.buffer
+    max_bytes = int(sys.argv[1])
+    file = _File(sys.stdout.fileno(), max_bytes)
+    error: str | None
+    recording = None
     try:
-        recording = Recording(stream)
-        # Unbuffered: a buffered one would wait for a megabyte, which is four seconds of ticks.
-        for message in msgpack.Unpacker(io.FileIO(sys.stdin.fileno()), raw=False):
-            recording.add(*message)
+        recording = Recording(file)
+        error = _write_all(recording, file, max_bytes)
         recording.finish()
-        stream.flush()
-    except OSError as error:
-        print(error.strerror, file=sys.stderr, flush=True)
+        _tell(recording.messages)
+    except OSError as failure:
+        error = failure.strerror
+        if recording is not None:
+            file.cut(recording.end)
+            _tell(recording.messages)
+    if error is not None:
+        _tell(error)
         os._exit(1)  # without another try, on the way out, to write what can't be written
     return 0
 

@@ -7,12 +7,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from palpate.files import LONGEST_NAME_BYTES, is_plain_name
 from palpate.model_file import ModelFileError, ReducedModel
-from palpate_server.realtime import scheduler, shared_memory
-from palpate_server.realtime.native_image import make_image
+from palpate_server.coupling import fixed_patch
+from palpate_server.realtime import shared_memory
 from palpate_server.session.devices import warnings_for
 from palpate_server.session.fields import shown
 from palpate_server.session.leases import Refused
@@ -31,9 +29,6 @@ class ModelLoader:
     def __init__(self, state: SessionState, folder: Path) -> None:
         self._state = state
         self._folder = folder
-        self._handed_over: tuple[
-            shared_memory.Memory, ...
-        ] = ()  # what the loop may still run on at the very end
 
     def load(self, client: str, file: object) -> dict[str, Any]:
         """Check a model file, fade over to its model, and let the old one go. Raises Refused."""
@@ -45,8 +40,7 @@ class ModelLoader:
             model = self._read(file)
             memory = self._fade_to(model)
             with state.model_in_use:
-                self._end_exchange(memory)
-                state.memory, state.model = memory, model
+                self._end_exchange(memory, model)
             log.info("now serving %s (order %d)", model.name, model.order)
             for warning in accuracy_warnings(model):
                 log.warning("%s", warning)
@@ -60,27 +54,23 @@ class ModelLoader:
     def _fade_to(self, model: ReducedModel) -> shared_memory.Memory:
         """Have the loop fade over to a model that starts settled at the present displacement; the memory to go on with."""
         state = self._state
-        following = shared_memory.make_model(model.discrete, state.memory.displacement.ravel().copy())
-        fade_step = model.period_s / FADE_OVER_S
-        fading = state.memory._replace(next_model=following, fade=np.array([0.0, fade_step]))
-        memory = state.memory._replace(
-            model=following,
-            snapshot_version=np.zeros(1, np.int64),
-            snapshot_tick=np.full(1, -1),
-            snapshot_state=np.zeros(model.order),
+        step = model.period_s / FADE_OVER_S
+        coupling = fixed_patch.fade_over(
+            state.memory.coupling, model.discrete, state.memory.displacement.copy(), step
         )
-        self._handed_over = (fading, memory)
-        state.undisturbed_since_tick = state.between_ticks(scheduler.exchange, make_image(fading))
-        while fading.fade[0] < 1.0:
+        fading = shared_memory.with_coupling(state.memory, coupling)
+        memory = shared_memory.with_coupling(state.memory, fixed_patch.faded_over(coupling))
+        state.undisturbed_since_tick = state.exchange(fading, state.model, model)
+        while coupling.fade[0] < 1.0:
             if state.stopping.wait(model.period_s):
                 raise Refused("stopping", "the server is stopping")
         return memory
 
-    def _end_exchange(self, memory: shared_memory.Memory) -> None:
+    def _end_exchange(self, memory: shared_memory.Memory, model: ReducedModel) -> None:
         """Once both models have run, the exchange is completed however late ticks are, unless the server stops."""
         while True:
             try:
-                self._state.between_ticks(scheduler.exchange, make_image(memory))
+                self._state.exchange(memory, model, None)
                 return
             except Refused as error:
                 if error.reason != "busy":

@@ -14,7 +14,8 @@ import zenoh
 
 from palpate_client.wire import ENCODING, pack
 from palpate_server import wire
-from palpate_server.realtime import scheduler, shared_memory, threads
+from palpate_server.realtime import scheduler, threads
+from palpate_server.realtime.records import RECORDS
 from palpate_server.recording.black_box import BlackBox
 from palpate_server.session.state import SessionState
 from palpate_server.session.status import status
@@ -32,6 +33,8 @@ class ForcePublisher:
         self._wake = wake
         self._sending = threading.Lock()
         self._encoder = wire.ForceEncoder(len(state.tools))
+        self._ticks, ports = state.memory.ring  # stays the same when the model is exchanged
+        self._ports = wire.as_words(ports)
         self._sent = 0
         self._publisher = session.declare_publisher(
             state.keys.force,
@@ -59,18 +62,14 @@ class ForcePublisher:
 
     def _send_and_release(self) -> None:
         try:
-            memory = self._state.memory
-            head = int(scheduler.records_written(memory.shared))
+            head = int(scheduler.records_written(self._state.memory.shared))
             if head - self._sent > MAX_UNSENT:
                 self._state.messages.unsent_forces += head - self._sent - MAX_UNSENT
                 self._sent = head - MAX_UNSENT
             while self._sent < head:
-                row = self._sent % shared_memory.RECORDS
-                start_ns = int(memory.record_times[row, shared_memory.START_NS])
-                payload = self._encoder.encode(
-                    self._sent, start_ns, memory.record_inputs[row], memory.record_motion[row]
-                )
-                self._publisher.put(payload)
+                row = self._sent % RECORDS
+                start_ns = int(self._ticks["start_ns"][row])
+                self._publisher.put(self._encoder.encode(self._sent, start_ns, self._ports[row]))
                 self._sent += 1
         finally:
             self._sending.release()

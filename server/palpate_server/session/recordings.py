@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate_server.recording.recorder import Recorder, file_in
+from palpate_server.realtime import scheduler
+from palpate_server.recording.recorder import Recorder, file_in, room_in
 from palpate_server.session.leases import Refused
 from palpate_server.session.state import SessionState
 from palpate_server.session.status import description
@@ -18,10 +20,13 @@ _END_TIMEOUT_S = 1.0
 class Recordings:
     """Begins and ends recordings in a folder, or refuses to where there is none."""
 
-    def __init__(self, state: SessionState, publish_status: Callable[[], None], folder: Path | None) -> None:
+    def __init__(
+        self, state: SessionState, publish_status: Callable[[], None], folder: Path | None, max_bytes: int
+    ) -> None:
         self._state = state
         self._publish_status = publish_status
         self._folder = folder
+        self._max_bytes = max_bytes  # that the folder may hold
         self._changing = threading.Lock()  # held while one begins or ends
 
     def record(self, file: object) -> dict[str, Any]:
@@ -46,15 +51,18 @@ class Recordings:
         state.check_running()
         if state.recorder is not None and state.recorder.error is None:
             raise Refused("busy", f"{state.recorder.file} is being recorded")
-        recorder = Recorder(path, state.keys, description(state), state.memory)
+        save = partial(state.between_ticks, scheduler.save)
+        room = room_in(path.parent, self._max_bytes)
+        recorder = Recorder(path, room, state.keys, description(state), state.memory, save)
         state.recorder = recorder
+        save()
         return recorder.report()
 
     def _end(self) -> dict[str, Any]:
         recorder = self._state.recorder
         if recorder is None:
             raise Refused("not_recording", "there is no recording to end")
-        self._publish_status()  # a replay reaches as far as the last status in the recording
+        self._publish_status()
         self._state.recorder = None
         recorder.stop()
         return recorder.report()

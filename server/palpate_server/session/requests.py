@@ -44,11 +44,12 @@ class Requests:
         publish_status: Callable[[], None],
         models: Path,
         recordings: Path | None,
+        max_recordings_bytes: int,
     ) -> None:
         self._state = state
         self._has_token = has_token
         self._loader = ModelLoader(state, models)
-        self.recordings = Recordings(state, publish_status, recordings)
+        self.recordings = Recordings(state, publish_status, recordings, max_recordings_bytes)
         self._alive: set[str] = set()  # clients whose liveliness token is known
 
     def on_client(self, client: str, alive: bool) -> None:

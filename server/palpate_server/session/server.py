@@ -29,6 +29,7 @@ from palpate_server.session.warm_up import warm_up
 
 log = logging.getLogger("palpate_server")
 
+USUAL_RECORDINGS_BYTES = 10 * 10**9
 USUAL_SURFACE_HZ, FASTEST_SURFACE_HZ = 30.0, 60.0
 _ALIVE_TIMEOUT_S = 1.0
 
@@ -39,7 +40,7 @@ class ServerOptions:
 
     limits      what no client can exceed
     models      the folder that clients may load from
-    recordings  the folder that clients may have recordings made in, or None
+    recordings  the folder that clients may have recordings made in, or None; it may hold max_recordings_bytes
     black_box   the folder for black box files, or None
     surface_hz  surfaces a second, at most FASTEST_SURFACE_HZ
     cpu         the processor for the threads that run ticks, or None to leave that to the system
@@ -48,6 +49,7 @@ class ServerOptions:
     limits: Limits
     models: Path
     recordings: Path | None = None
+    max_recordings_bytes: int = USUAL_RECORDINGS_BYTES
     black_box: Path | None = None
     surface_hz: float = USUAL_SURFACE_HZ
     cpu: int | None = None
@@ -77,7 +79,12 @@ class Server:
         self._status = StatusPublisher(state, session, black_box or None)
         self._surface = SurfacePublisher(state, session)
         self._requests = Requests(
-            state, self._has_token, self._status.publish, options.models, options.recordings
+            state,
+            self._has_token,
+            self._status.publish,
+            options.models,
+            options.recordings,
+            options.max_recordings_bytes,
         )
         self._queries = Queries(
             keys,

@@ -13,6 +13,7 @@ from palpate_client.wire import MALFORMED, REFUSED, Keys
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import Limits
+from palpate_server.recording import snapshot
 from palpate_server.recording.recorder import Recorder
 from palpate_server.session.frame import IDENTITY
 from palpate_server.session.leases import Leases, Refused, ToolSettings
@@ -21,14 +22,10 @@ CHANGE_TIMEOUT_S = 1.0
 
 
 class MessageCounters:
-    """How many commands were accepted, refused and malformed, by reason; written by the receiving thread.
+    """How many commands were accepted, refused and malformed, by reason; written by the receiving thread."""
 
-    accepted_of counts by tool: a command can move several.
-    """
-
-    def __init__(self, n_tools: int) -> None:
+    def __init__(self) -> None:
         self.accepted = 0
-        self.accepted_of = [0] * n_tools
         self.refused: Counter[str] = Counter(dict.fromkeys(REFUSED, 0))
         self.malformed: Counter[str] = Counter(dict.fromkeys(MALFORMED, 0))
         self.unsent_forces = 0
@@ -40,6 +37,7 @@ class SessionState:
     limits                  what no client can exceed
     tools                   their names, in the model's order
     tool_index              of a tool's name
+    lease_numbers           of the present hold of each tool, as in the loop's memory
     running                 False once the server stops: commands and requests are then refused
     stopping                set when all threads are to end
     undisturbed_since_tick  of the last reset or change of model
@@ -55,19 +53,16 @@ class SessionState:
         self.surface_period_s = surface_period_s
         self.tools = tuple(contact.name for contact in model.contacts)
         self.tool_index = {name: i for i, name in enumerate(self.tools)}
-        self.memory = shared_memory.make_memory(
-            model.discrete, model.period_s, [limits] * len(self.tools), surface_period_s
-        )
         homes = [contact.center_m for contact in model.contacts]
-        for positions in (self.memory.origin, self.memory.target, self.memory.position):
-            positions[:] = homes
-        for positions in (self.memory.device, self.memory.applied):
-            positions[:] = homes
+        self.memory = shared_memory.make_memory(
+            model.discrete, model.period_s, [limits] * len(self.tools), surface_period_s, homes
+        )
+        self.lease_numbers = [0] * len(self.tools)
         self.image = make_image(self.memory)
         self.leases = Leases(
             {name: ToolSettings(limits, IDENTITY, home) for name, home in zip(self.tools, homes, strict=True)}
         )
-        self.messages = MessageCounters(len(self.tools))
+        self.messages = MessageCounters()
         self.running = True
         self.stopping = threading.Event()
         self.undisturbed_since_tick = 0
@@ -76,6 +71,7 @@ class SessionState:
         self.exchanging = threading.Lock()
         self.model_in_use = threading.Lock()
         self._changing = threading.Lock()  # the loop has one slot for changes
+        self._following: ReducedModel | None = None  # is being faded in
 
     def check_running(self) -> None:
         """Raises Refused once the server stops."""
@@ -93,17 +89,39 @@ class SessionState:
     def forget_commands(self, tools: Iterable[str]) -> None:
         """Let the forces of tools fade from the next tick on."""
         for name in tools:
-            scheduler.forget_command(self.memory.commands, self.tool_index[name])
+            tool = self.tool_index[name]
+            scheduler.forget_command(self.memory.commands, tool)
+            self.lease_numbers[tool] += 1
 
     def between_ticks(self, ask: Callable[..., None], *what: Any) -> int:
         """Have the loop change something; the first tick after it. Raises Refused when no tick comes: nothing is changed."""
         with self._changing:
-            if self.stopping.is_set():
-                raise Refused("stopping", "the server is stopping")
-            give_up = time.monotonic() + CHANGE_TIMEOUT_S
-            ask(self.image, *what)
-            while (tick := scheduler.changed_at(self.image)) < 0:
-                if time.monotonic() > give_up and scheduler.withdraw_change(self.image):
-                    raise Refused("busy", "no tick came that could have made the change")
-                time.sleep(self.model.period_s / 4)
+            tick = self._change(ask, *what)
+            self._record_settings()
             return tick
+
+    def exchange(
+        self, memory: shared_memory.Memory, model: ReducedModel, following: ReducedModel | None
+    ) -> int:
+        """Have the loop go on with another memory, of a model and the one that is faded in; like `between_ticks`."""
+        with self._changing:
+            tick = self._change(scheduler.exchange, make_image(memory))
+            self.memory, self.model, self._following = memory, model, following
+            self._record_settings()
+            return tick
+
+    def _change(self, ask: Callable[..., None], *what: Any) -> int:
+        if self.stopping.is_set():
+            raise Refused("stopping", "the server is stopping")
+        give_up = time.monotonic() + CHANGE_TIMEOUT_S
+        ask(self.image, *what)
+        while (tick := scheduler.changed_at(self.image)) < 0:
+            if time.monotonic() > give_up and scheduler.withdraw_change(self.image):
+                raise Refused("busy", "no tick came that could have made the change")
+            time.sleep(self.model.period_s / 4)
+        return tick
+
+    def _record_settings(self) -> None:
+        """Tell a recording of the change that was made; before the next one, which saves another state."""
+        if self.recorder is not None:
+            self.recorder.settings(snapshot.as_message(self.memory, self.model, self._following))

@@ -11,20 +11,14 @@ from numpy.typing import NDArray
 
 from palpate_client.wire import DROPPED, SCHEMA_VERSION, Flags, Kind
 from palpate_server.realtime import safety, scheduler, shared_memory
+from palpate_server.realtime.records import COUNTERS, RECORDS
 from palpate_server.session.devices import PROFILES
 from palpate_server.session.state import MessageCounters, SessionState
 
 STATUS_PERIOD_S = 0.1
 ROLLING_TICKS = 100
 _BIN_S = 1e-6
-_TICK_COUNTERS = {
-    "ticks": shared_memory.TICKS,
-    "ticks_on_arrival": shared_memory.TICKS_ON_ARRIVAL,
-    "late_ticks": shared_memory.LATE_TICKS,
-    "caught_up_ticks": shared_memory.CAUGHT_UP_TICKS,
-    "skipped_ticks": shared_memory.SKIPPED_TICKS,
-    "faults": shared_memory.FAULTS,
-}
+_TICK_COUNTERS = ("ticks", "ticks_on_arrival", "late_ticks", "caught_up_ticks", "skipped_ticks", "faults")
 _DURATIONS = {
     "timer_lateness_s": shared_memory.TIMER_LATENESS,
     "tick_lateness_s": shared_memory.TICK_LATENESS,
@@ -56,8 +50,8 @@ def recent_success_rate(memory: shared_memory.Memory, tool: int) -> float:
     head = int(scheduler.records_written(memory.shared))
     if head == 0:
         return 0.0
-    ticks = np.arange(max(0, head - ROLLING_TICKS), head) % shared_memory.RECORDS
-    flags = memory.record_inputs[ticks, tool, shared_memory.CONTACT_FLAGS]
+    ticks = np.arange(max(0, head - ROLLING_TICKS), head) % RECORDS
+    flags = memory.ring.ports["flags"][ticks, tool]
     late = Flags.HELD | Flags.DECAYING | Flags.STALE
     return float(np.mean(flags & int(late) == 0))
 
@@ -67,21 +61,20 @@ def dropped(memory: shared_memory.Memory, messages: MessageCounters) -> dict[str
 
     A command that waits for the tick at this moment is not yet used and counts as superseded until it is.
     """
-    used = memory.tallies[:, shared_memory.FRESH_TICKS].tolist()
-    superseded = sum(messages.accepted_of) - sum(used)
+    superseded = int(memory.commands.accepted.sum() - memory.ports["fresh_ticks"].sum())
     return dict(zip(DROPPED, (max(0, superseded), messages.unsent_forces), strict=True))
 
 
 def success_rate(memory: shared_memory.Memory, tool: int) -> float | None:
     """Share of the ticks since the start in which a new command had come in time, of those with a client; None without."""
-    commanded, fresh = memory.tallies[tool].tolist()
+    commanded, fresh = (int(memory.ports[name][tool]) for name in ("commanded_ticks", "fresh_ticks"))
     return fresh / commanded if commanded else None
 
 
 def status(state: SessionState, number: int) -> dict[str, Any]:
     """The status message; `number` counts them."""
     memory, messages, model = state.memory, state.messages, state.model
-    ticks = memory.counters.tolist()
+    counters = dict(zip(COUNTERS.names or (), memory.counters[0].tolist(), strict=True))
     return {
         "kind": Kind.STATUS,
         "number": number,
@@ -89,8 +82,8 @@ def status(state: SessionState, number: int) -> dict[str, Any]:
         "server_time_ns": time.monotonic_ns(),
         "model": {"name": model.name, "order": model.order, "config_sha256": model.config_sha256},
         "undisturbed_since_tick": state.undisturbed_since_tick,
-        "at_rest_since_tick": ticks[shared_memory.AT_REST_SINCE],
-        **{name: ticks[column] for name, column in _TICK_COUNTERS.items()},
+        "at_rest_since_tick": counters["at_rest_since"],
+        **{name: counters[name] for name in _TICK_COUNTERS},
         "lost_clients": state.lost_clients,
         **{
             name: percentiles(memory.histograms[row].copy(), int(memory.longest_ns[row]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import threading
-import time
 
 import numpy as np
 
@@ -43,17 +42,16 @@ def _call_each(period_s: float, n_tools: int) -> None:
     )
     limits = [Limits(1.0, 1.0, 1.0, 1.0, 1.0)] * n_tools
     memory = shared_memory.make_memory(system, period_s, limits, period_s)
-    scheduler.stage_command(memory.commands, 0, 1, 1, 1, -1, 0, wire.STILL, wire.STILL)
-    scheduler.write_command(memory.commands, 0, 1, 1, 1, -1, 0, wire.STILL, wire.STILL)
     scheduler.forget_command(memory.commands, 0)
     image = make_image(memory)
-    scheduler.tick_on_arrival(image, time.monotonic_ns())
+    scheduler.arrive(image, 1)
     scheduler.records_written(memory.shared)
-    wire.ForceEncoder(n_tools).encode(0, 0, memory.record_inputs[0], memory.record_motion[0])
+    wire.ForceEncoder(n_tools).encode(0, 0, wire.as_words(memory.ring.ports)[0])
     scheduler.is_silent(image, 0)
     scheduler.set_frame(image, 0, np.eye(3), 1.0, np.zeros(3))
     scheduler.set_limits(image, 0, np.ones(len(Limits._fields)))
     scheduler.reset(image)
+    scheduler.save(image)
     scheduler.exchange(image, make_image(memory))
     scheduler.changed_at(image)
     scheduler.withdraw_change(image)

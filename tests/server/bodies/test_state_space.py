@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from palpate.model_file import ReducedModel
+from palpate.model_file import ReducedModel, StateSpace
 from palpate_server.bodies import state_space
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.realtime import scheduler, shared_memory
@@ -23,28 +23,31 @@ def test_block_diagonal_steps_equal_dense_matrix_products(
 ) -> None:
     system = make_spring_mass_model(n_contacts, n_modes).discrete
     a, b, c, d = system.dense_a(), system.b, system.c, system.d
+    body = state_space.make_body(system)
     random = np.random.default_rng(0)
-    state = np.zeros(system.order)
     expected_state = np.zeros(system.order)
-    force = np.zeros(len(c))
-    b_transposed = np.ascontiguousarray(b.T)
     size = np.abs(c).max() * np.abs(b).max() * system.order + np.abs(d).max()
     for _ in range(200):
         displacement = random.normal(size=(b.shape[1],))
-        state_space.output(c, d, state, displacement, force)
-        np.testing.assert_allclose(force, c @ expected_state + d @ displacement, rtol=0, atol=1e-13 * size)
-        state_space.update(system.diagonal, system.cross, b_transposed, state, displacement)
+        state_space.output(body, displacement)
+        np.testing.assert_allclose(
+            body.force, c @ expected_state + d @ displacement, rtol=0, atol=1e-13 * size
+        )
+        state_space.update(body, displacement)
         expected_state = a @ expected_state + b @ displacement
     scale = np.abs(expected_state).max()
-    np.testing.assert_allclose(state, expected_state, rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(body.state, expected_state, rtol=0, atol=1e-12 * scale)
 
 
 def test_a_step_does_not_change_its_input() -> None:
-    state, displacement = np.ones(2), np.full(3, 0.5)
-    c, d, b_transposed, force = np.ones((3, 2)), np.ones((3, 3)), np.ones((3, 2)), np.zeros(3)
-    state_space.output(c, d, state, displacement, force)
-    np.testing.assert_array_equal(state, 1.0)
-    state_space.update(np.ones(2), np.zeros(2), b_transposed, state, displacement)
+    displacement = np.full(3, 0.5)
+    body = state_space.make_body(
+        StateSpace(np.ones(2), np.zeros(2), np.ones((2, 3)), np.ones((3, 2)), np.ones((3, 3)))
+    )
+    body.state[:] = 1.0
+    state_space.output(body, displacement)
+    np.testing.assert_array_equal(body.state, 1.0)
+    state_space.update(body, displacement)
     np.testing.assert_array_equal(displacement, 0.5)
 
 
@@ -103,18 +106,18 @@ def test_every_force_is_rounded_the_same_wherever_its_code_was_compiled() -> Non
         now = (tick + 1) * 1_000_000
         displacement = 1e-3 * random.normal(size=6)
         for contact in range(2):
-            target = tuple(displacement[3 * contact : 3 * contact + 3].tolist())
-            scheduler.write_command(memory.commands, contact, tick, 0, now, -1, 0, target, (0.0, 0.0, 0.0))
-        scheduler.repeat_tick(image, now)
+            target = displacement[3 * contact : 3 * contact + 3]
+            memory.commands.newest[contact] = (contact, 0, tick, 0, now, -1, target, (0.0, 0.0, 0.0))
+        scheduler.repeat_tick(image, now, now, False)
         force = [
             summed_in_the_stated_order(c, state) + summed_in_the_stated_order(d, displacement)
             for c, d in zip(system.c, system.d, strict=True)
         ]
-        np.testing.assert_array_equal(memory.force.ravel(), force)
+        np.testing.assert_array_equal(memory.force.ravel(), np.negative(force))
         partner = state.reshape(-1, 2)[:, ::-1].ravel()
         following = system.diagonal * state + system.cross * partner
         for column, u in zip(system.b.T, displacement, strict=True):
             following = following + column * u
         state = following
-    np.testing.assert_array_equal(memory.model.state, state)
+    np.testing.assert_array_equal(memory.coupling.body.state, state)
     assert np.all(memory.force != 0.0)

@@ -171,10 +171,10 @@ def test_the_server_is_told_which_force_was_rendered_so_that_it_counts_the_ports
     monkeypatch.setattr(shared_memory, "make_memory", keep)
     late, begin, end = 3, 500, 900
     motion = press(spring(300.0), HANDLE, REACH_M[:1000], steady_trace(1000, late), 0.0)
-    records = memories[0].record_motion[:, 0]
+    energy_j = memories[0].ring.ports["energy_j"][:, 0]
     depth, rendered = motion[:, 0], 300.0 * motion[:, 0]  # the tick that answers a position has its number
     taken_in = np.sum(rendered[begin - late : end - late] * np.diff(depth[begin : end + 1]))
-    counted = records[end, shared_memory.ENERGY_J] - records[begin, shared_memory.ENERGY_J]
+    counted = energy_j[end] - energy_j[begin]
     assert abs(taken_in) > 1e-8
     assert counted == pytest.approx(taken_in, rel=1e-9)
 

@@ -12,9 +12,12 @@ from numba.core.runtime import _nrt_python as nrt
 from numba.core.runtime.nrt import rtsys
 
 from palpate.model_file import ReducedModel
+from palpate_client.wire import Flags
+from palpate_server.coupling import fixed_patch
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import Image, make_image
-from palpate_server.realtime.safety import Flags, Limits
+from palpate_server.realtime.records import RECORDS
+from palpate_server.realtime.safety import Limits
 
 PERIOD_NS = 1_000_000
 LIMITS = Limits(
@@ -27,19 +30,23 @@ LIMITS = Limits(
 
 
 @njit()
-def silent_ticks(n: int, commands: shared_memory.Commands, image: Image, start_ns: int) -> None:
+def silent_ticks(n: int, incoming: np.ndarray, image: Image, start_ns: int) -> None:
     for k in range(n):
-        scheduler.repeat_tick(image, start_ns + k * PERIOD_NS)
+        now = start_ns + k * PERIOD_NS
+        scheduler.repeat_tick(image, now, now, False)
 
 
 @njit()
-def commanded_ticks(n: int, commands: shared_memory.Commands, image: Image, start_ns: int) -> None:
+def commanded_ticks(n: int, incoming: np.ndarray, image: Image, start_ns: int) -> None:
     """A new command before each tick: a tip that pushes beyond its workspace and comes back at once, again and again."""
     for k in range(n):
         now = start_ns + k * PERIOD_NS
         depth = 0.03 if k % 40 < 20 else 0.0
-        scheduler.write_command(commands, 0, k, now, now, -1, 0, (0.0, 0.0, depth), (0.0, 0.0, 0.0))
-        scheduler.repeat_tick(image, now)
+        command = incoming[0]
+        command.sequence = command.arrival_ns = now
+        command.position_m[2] = depth
+        scheduler.hand_over(image, 1)
+        scheduler.repeat_tick(image, now, now, False)
 
 
 @njit()
@@ -77,11 +84,11 @@ class Ticks:
 
     def allocations(self, ticks: Callable[..., None], n: int) -> int:
         first = scheduler.records_written(self.memory.shared)
-        count = allocations(ticks, n, self.memory.commands, self.image, self.now)
+        count = allocations(ticks, n, self.memory.commands.incoming, self.image, self.now)
         assert scheduler.records_written(self.memory.shared) == first + n
         self.now += n * PERIOD_NS
-        rows = np.arange(first, first + n) % shared_memory.RECORDS
-        self.flags = list(self.memory.record_inputs[rows, 0, shared_memory.CONTACT_FLAGS])
+        rows = np.arange(first, first + n) % RECORDS
+        self.flags = list(self.memory.ring.ports["flags"][rows, 0])
         return count
 
     def seen(self, flag: Flags) -> bool:
@@ -119,7 +126,7 @@ def test_no_tick_allocates_from_the_first_command_to_silence(ticks: Ticks) -> No
 
 def test_no_tick_allocates_while_passivity_is_kept(ticks: Ticks) -> None:
     assert ticks.allocations(commanded_ticks, 300) == 0
-    ticks.memory.energy[:] = -1.0  # the port has given out energy
+    ticks.memory.ports["energy_j"] = -1.0  # the port has given out energy
     assert ticks.allocations(commanded_ticks, 40) == 0
     assert ticks.seen(Flags.PASSIVITY_LIMITED)
 
@@ -128,28 +135,29 @@ def test_no_tick_allocates_while_one_model_fades_into_another(
     ticks: Ticks, make_spring_mass_model: Callable[..., ReducedModel]
 ) -> None:
     assert ticks.allocations(commanded_ticks, 300) == 0
-    following = shared_memory.make_model(make_spring_mass_model(2, 7).discrete)
-    fading = ticks.memory._replace(next_model=following, fade=np.array([0.0, 0.01]))
+    other = make_spring_mass_model(2, 7).discrete
+    coupling = fixed_patch.fade_over(ticks.memory.coupling, other, np.zeros((2, 3)), 0.01)
+    fading = shared_memory.with_coupling(ticks.memory, coupling)
     scheduler.exchange(ticks.image, make_image(fading))
     assert ticks.allocations(commanded_ticks, 50) == 0
     assert scheduler.changed_at(ticks.image) >= 0
-    assert fading.fade[0] == pytest.approx(0.5)
-    assert np.any(following.state)
+    assert coupling.fade[0] == pytest.approx(0.5)
+    assert np.any(coupling.following.state)
 
 
 def test_a_tick_with_a_fault_does_not_allocate(ticks: Ticks) -> None:
     assert ticks.allocations(commanded_ticks, 300) == 0
-    ticks.memory.model.state[0] = np.nan
+    ticks.memory.coupling.body.state[0] = np.nan
     assert ticks.allocations(commanded_ticks, 10) == 0
     assert ticks.seen(Flags.FAULT)
-    assert ticks.memory.counters[shared_memory.FAULTS] == 1
+    assert ticks.memory.counters["faults"][0] == 1
 
 
 def test_a_tick_that_takes_up_a_change_does_not_allocate(ticks: Ticks) -> None:
     assert ticks.allocations(commanded_ticks, 300) == 0
     scheduler.set_limits(ticks.image, 0, np.array(LIMITS._replace(max_force_n=0.2)))
     assert ticks.allocations(commanded_ticks, 10) == 0
-    assert ticks.memory.limits[0, shared_memory.MAX_FORCE] == 0.2
+    assert ticks.memory.settings["max_force_n"][0] == 0.2
     scheduler.reset(ticks.image)
     assert ticks.allocations(commanded_ticks, 10) == 0
     assert ticks.seen(Flags.SOFT_START)

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from palpate_client.wire import Flags
 from palpate_server.realtime import safety
-from palpate_server.realtime.safety import Flags
 
 coordinate = st.floats(-1e6, 1e6)
 vector = st.tuples(coordinate, coordinate, coordinate).map(np.array)

@@ -12,10 +12,14 @@ import pytest
 from numba import njit
 
 from palpate.model_file import ReducedModel, StateSpace
-from palpate_server.realtime import atomics, safety, scheduler, shared_memory
+from palpate_client.wire import Flags
+from palpate_server.bodies import state_space
+from palpate_server.coupling import fixed_patch
+from palpate_server.realtime import safety, scheduler, shared_memory
 from palpate_server.realtime.clock import monotonic_ns
 from palpate_server.realtime.native_image import Image, make_image
-from palpate_server.realtime.safety import Flags, Limits
+from palpate_server.realtime.records import RECORDS
+from palpate_server.realtime.safety import Limits
 
 FREE = Limits(1e6, 1e12, 1e6, 1e6, 0.0)  # limits that nothing here reaches
 PERIOD_NS = 1_000_000
@@ -23,25 +27,52 @@ PERIOD_NS = 1_000_000
 
 def now_ns(memory: shared_memory.Memory) -> int:
     """When the next tick begins: a period after the last one, however long the test takes."""
-    return (1000 + int(memory.counters[shared_memory.TICKS])) * PERIOD_NS
+    return (1000 + int(memory.counters["ticks"][0])) * PERIOD_NS
+
+
+Vector = tuple[float, float, float]
+STILL: Vector = (0.0, 0.0, 0.0)
+
+
+def write(
+    memory: shared_memory.Memory,
+    tool: int,
+    sequence: int,
+    arrival_ns: int,
+    target: Vector,
+    velocity: Vector = STILL,
+    rendered_tick: int = -1,
+    lease: int | None = None,
+) -> None:
+    """Put a command where the next tick finds it, whatever its numbers are."""
+    held = memory.commands.lease[tool] if lease is None else lease
+    memory.commands.newest[tool] = (tool, held, sequence, 7, arrival_ns, rendered_tick, target, velocity)
 
 
 def command(
     memory: shared_memory.Memory, sequence: int, target: tuple[float, float, float], age_ns: int = 0
 ) -> None:
-    lease = int(memory.commands.lease[0])
-    scheduler.write_command(
-        memory.commands, 0, sequence, 7, now_ns(memory) - age_ns, -1, lease, target, (0.0, 0.0, 0.0)
-    )
+    write(memory, 0, sequence, now_ns(memory) - age_ns, target)
+
+
+def repeat_tick(image: Image, now: int) -> None:
+    scheduler.repeat_tick(image, now, now, False)
 
 
 def tick(memory: shared_memory.Memory) -> tuple[int, np.ndarray, np.ndarray, float]:
-    """Run one tick; its flags, applied displacement, force and scale."""
-    scheduler.repeat_tick(make_image(memory), now_ns(memory))
-    row = (scheduler.records_written(memory.shared) - 1) % shared_memory.RECORDS
-    motion = memory.record_motion[row, 0]
-    flags = int(memory.record_inputs[row, 0, shared_memory.CONTACT_FLAGS])
-    return flags, motion[0:3].copy(), motion[3:6].copy(), float(motion[shared_memory.SCALE])
+    """Run one tick; its flags, applied position, force and scale."""
+    repeat_tick(make_image(memory), now_ns(memory))
+    port = newest(memory)[0]
+    return int(port["flags"]), port["position_m"].copy(), port["force_n"].copy(), float(port["force_scale"])
+
+
+def newest(memory: shared_memory.Memory) -> np.ndarray:
+    """The records of the last tick, (n_tools,)."""
+    return memory.ring.ports[(scheduler.records_written(memory.shared) - 1) % RECORDS]
+
+
+def tallies(memory: shared_memory.Memory) -> list[int]:
+    return [int(memory.ports[name][0]) for name in ("commanded_ticks", "fresh_ticks")]
 
 
 @pytest.fixture
@@ -71,9 +102,9 @@ def test_without_a_command_the_force_is_zero_and_stale_and_nothing_is_echoed(
     assert flags == Flags.STALE
     assert scale == 0
     np.testing.assert_array_equal(force, 0)
-    echoed = memory.record_inputs[:3, 0, :3]
-    np.testing.assert_array_equal(echoed[0, :2], (1, 7))
-    np.testing.assert_array_equal(echoed[1:], -1)
+    for name, echoed in (("sequence", 1), ("client_time_ns", 7)):
+        np.testing.assert_array_equal(memory.ring.ports[name][:3, 0], [echoed, -1, -1])
+    np.testing.assert_array_equal(memory.ring.ports["input_age_ns"][1:3, 0], -1)
 
 
 def test_forces_are_the_discrete_models_response_to_the_applied_displacements(
@@ -86,7 +117,7 @@ def test_forces_are_the_discrete_models_response_to_the_applied_displacements(
         _, applied, force, scale = tick(memory)
         expected = system.c @ state + system.d @ applied
         state = system.dense_a() @ state + system.b @ applied
-        np.testing.assert_allclose(force, scale * expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(force, -scale * expected, rtol=0, atol=1e-12)  # on the tool
     assert scale == 1
 
 
@@ -196,12 +227,12 @@ def test_a_model_that_gives_nan_is_put_to_rest_and_counted(memory: shared_memory
     for i in range(10):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
-    memory.model.state[0] = np.nan
+    memory.coupling.body.state[0] = np.nan
     flags, _, force, scale = tick(memory)
     assert flags & Flags.FAULT
     assert scale == 0
     np.testing.assert_array_equal(force, 0)
-    assert memory.counters[shared_memory.FAULTS] == 1
+    assert memory.counters["faults"][0] == 1
     flags, _, force, _ = tick(memory)
     assert not flags & Flags.FAULT
     assert np.all(np.isfinite(force))
@@ -223,7 +254,7 @@ def test_commands_and_forces_are_in_the_holders_frame(
         displacement = scale * rotation @ (applied - origin)
         expected = scale * rotation.T @ (system.c @ state + system.d @ displacement)
         state = system.dense_a() @ state + system.b @ displacement
-        np.testing.assert_allclose(force, fade * expected, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(force, -fade * expected, rtol=0, atol=1e-11)
 
 
 USUAL = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
@@ -279,7 +310,7 @@ def test_the_workspace_is_around_the_frames_origin(spring: shared_memory.Memory)
     for i in range(300, 400):
         command(spring, i, (5.0, 0.0, 1e-3))
         _, _, force, _ = tick(spring)
-    np.testing.assert_allclose(force, (0.0, 0.0, 1e-3 * SPRING_N_PER_M))
+    np.testing.assert_allclose(force, (0.0, 0.0, -1e-3 * SPRING_N_PER_M))
     for i in range(400, 600):
         command(spring, i, (5.5, 0.0, 0.0))
         flags, applied, *_ = tick(spring)
@@ -302,7 +333,7 @@ def test_a_reset_puts_the_tip_to_rest_and_takes_the_force_down_at_the_allowed_ra
     scheduler.reset(make_image(spring))
     command(spring, 299, (0.0, 0.0, 0.05))
     _, _, before, _ = tick(spring)
-    assert spring.energy[0] == 0  # the device has not moved
+    assert spring.ports["energy_j"][0] == 0  # the device has not moved
     for i in range(300, 320):
         command(spring, i, (0.0, 0.0, 0.0))
         flags, applied, force, _ = tick(spring)
@@ -354,17 +385,17 @@ def test_extreme_numbers_hold_the_tip_and_leave_another_contact_alone(
         now = now_ns(memory)
         good = (0.0, 0.0, 1e-3)
         for m in (memory, undisturbed):
-            scheduler.write_command(m.commands, 1, i, 7, now, -1, 0, good, (0.0, 0.0, 0.0))
-            scheduler.write_command(m.commands, 0, i, 7, now, -1, 0, good, (0.0, 0.0, 0.0))
+            write(m, 1, i, now, good)
+            write(m, 0, i, now, good)
         if i >= 250:
-            scheduler.write_command(memory.commands, 0, i, 7, now - 5_000_000, -1, 0, huge, huge)
+            write(memory, 0, i, now - 5_000_000, huge, huge)
         for m in (memory, undisturbed):
             tick(m)
-    row = (scheduler.records_written(memory.shared) - 1) % shared_memory.RECORDS
-    np.testing.assert_array_equal(memory.record_motion[row, 0, 0:3], (0.0, 0.0, 1e-3))
-    np.testing.assert_array_equal(memory.record_motion[row], undisturbed.record_motion[row])
-    assert np.any(memory.record_motion[row, 1, 3:6])
-    assert memory.counters[shared_memory.FAULTS] == 0
+    for name in ("position_m", "force_n", "force_scale", "energy_j"):
+        np.testing.assert_array_equal(newest(memory)[name], newest(undisturbed)[name])
+    np.testing.assert_array_equal(newest(memory)["position_m"][0], (0.0, 0.0, 1e-3))
+    assert np.any(newest(memory)["force_n"][1])
+    assert memory.counters["faults"][0] == 0
 
 
 @pytest.mark.parametrize("size", [1e160, 1.797e308, float("inf"), float("nan")])
@@ -381,7 +412,7 @@ def test_a_target_without_a_finite_length_is_not_followed(memory: shared_memory.
 def test_a_velocity_carries_the_displacement_on_between_commands(memory: shared_memory.Memory) -> None:
     for age_ns, carried_m in ((4_000_000, 0.4e-3), (10_000_000, 0.5e-3)):  # at 0.1 m/s, and no more than 5 ms
         arrival = now_ns(memory) - age_ns
-        scheduler.write_command(memory.commands, 0, 1, 7, arrival, -1, 0, (1e-3, 0.0, 0.0), (0.1, 0.0, 0.0))
+        write(memory, 0, 1, arrival, (1e-3, 0.0, 0.0), (0.1, 0.0, 0.0))
         _, applied, *_ = tick(memory)
         assert applied[0] == pytest.approx(1e-3 + carried_m, rel=1e-12)
 
@@ -392,47 +423,44 @@ def test_energy_counts_the_force_that_the_device_was_rendering(memory: shared_me
     for i in range(100):
         position = (0.0, 0.0, 1e-3 * np.sin(0.2 * i))
         rendered = i - 3 if i >= 3 else -1  # a device that is three ticks behind
-        scheduler.write_command(
-            memory.commands, 0, i, 7, now_ns(memory), rendered, 0, position, (0.0, 0.0, 0.0)
-        )
+        write(memory, 0, i, now_ns(memory), position, rendered_tick=rendered)
         _, applied, force, _ = tick(memory)
         if i:
             step = applied[2] - positions[-1]
-            expected += (forces[rendered] if rendered >= 0 else forces[-1]) * step
+            expected -= (forces[rendered] if rendered >= 0 else forces[-1]) * step
         forces.append(force[2])
         positions.append(applied[2])
-    row = (scheduler.records_written(memory.shared) - 1) % shared_memory.RECORDS
-    np.testing.assert_allclose(memory.record_motion[row, 0, shared_memory.ENERGY_J], expected, rtol=1e-9)
+    np.testing.assert_allclose(newest(memory)["energy_j"][0], expected, rtol=1e-9)
 
 
 def test_energy_is_that_of_the_device_also_while_the_tip_is_let_after_it_slowly(
     spring: shared_memory.Memory,
 ) -> None:
     """A limit of the speed makes of a passive spring one that gives out energy: the observer has to see it."""
-    spring.limits[0, shared_memory.MAX_SPEED] = 0.17
-    spring.limits[0, shared_memory.MAX_FORCE] = spring.limits[0, shared_memory.MAX_FORCE_RATE] = 1e6
+    spring.settings["max_speed_m_per_s"] = 0.17
+    spring.settings["max_force_n"] = spring.settings["max_force_rate_n_per_s"] = 1e6
     energy, force, before = 0.0, np.zeros(3), 0.0
     limited = False
     for i in range(3000):
         position = 0.008 * np.sin(2 * np.pi * 5 * i * 1e-3)
         command(spring, i, (0.0, 0.0, position))
-        energy += force[2] * (position - before)
+        energy -= force[2] * (position - before)
         before = position
         flags, _, force, _ = tick(spring)
         limited = limited or bool(flags & Flags.SPEED_LIMITED)
     assert limited
     assert energy < -0.1
-    np.testing.assert_allclose(spring.energy[0], energy, rtol=1e-9)
+    np.testing.assert_allclose(spring.ports["energy_j"][0], energy, rtol=1e-9)
 
 
 def test_a_command_of_a_hold_that_is_over_is_not_carried_out(memory: shared_memory.Memory) -> None:
     now = now_ns(memory)
     scheduler.forget_command(memory.commands, 0)
-    scheduler.write_command(memory.commands, 0, 5, 7, now, -1, 0, (0.0, 0.0, 1e-3), (0.0, 0.0, 0.0))
+    write(memory, 0, 5, now, (0.0, 0.0, 1e-3), lease=0)
     flags, applied, _, scale = tick(memory)
     assert flags == Flags.STALE
     np.testing.assert_array_equal(applied, 0)
-    scheduler.write_command(memory.commands, 0, 1, 7, now, -1, 1, (0.0, 0.0, 1e-3), (0.0, 0.0, 0.0))
+    write(memory, 0, 1, now, (0.0, 0.0, 1e-3), lease=1)
     flags, applied, _, scale = tick(memory)
     assert scale > 0
     np.testing.assert_array_equal(applied, (0.0, 0.0, 1e-3))
@@ -443,11 +471,11 @@ def test_a_change_that_is_withdrawn_is_not_made(memory: shared_memory.Memory) ->
     scheduler.set_limits(image, 0, np.full(5, 2.0))
     assert scheduler.withdraw_change(image)
     tick(memory)
-    np.testing.assert_array_equal(memory.limits[0], FREE)
+    assert memory.settings[0].tolist()[:5] == FREE
     scheduler.set_limits(image, 0, np.full(5, 2.0))
     tick(memory)
     assert not scheduler.withdraw_change(image)
-    np.testing.assert_array_equal(memory.limits[0], 2.0)
+    assert memory.settings[0].tolist()[:5] == (2.0,) * 5
 
 
 def test_a_client_that_hovers_at_the_surface_does_not_leave_the_state_to_decay_for_ever(
@@ -459,10 +487,10 @@ def test_a_client_that_hovers_at_the_surface_does_not_leave_the_state_to_decay_f
     for i in range(300, 20_000):
         command(memory, i, (0.0, 0.0, 0.0))
         tick(memory)
-        if not np.any(memory.model.state):
+        if not np.any(memory.coupling.body.state):
             break
-    assert not np.any(memory.model.state)
-    assert memory.counters[shared_memory.AT_REST_SINCE] == -1  # somebody is there
+    assert not np.any(memory.coupling.body.state)
+    assert memory.counters["at_rest_since"][0] == -1  # somebody is there
 
 
 def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(
@@ -471,13 +499,13 @@ def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(
     for i in range(250):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
-    assert np.any(memory.model.state)
+    assert np.any(memory.coupling.body.state)
     scheduler.reset(make_image(memory))
     assert scheduler.changed_at(make_image(memory)) == -1
     command(memory, 250, (0.0, 0.0, 1e-3))
     flags, applied, _, scale = tick(memory)
     assert scheduler.changed_at(make_image(memory)) == 250
-    np.testing.assert_allclose(memory.force[0], make_spring_mass_model().discrete.d @ applied, rtol=1e-12)
+    np.testing.assert_allclose(memory.force[0], -make_spring_mass_model().discrete.d @ applied, rtol=1e-12)
     assert flags & Flags.SOFT_START
     assert scale < 0.01
 
@@ -489,32 +517,39 @@ def test_another_model_is_faded_in_where_it_settles(
     running = make_spring_mass_model().discrete
     for i in range(300):
         if i == 250:  # the soft start is over: the running model has settled too
-            memory.model.state[:] = shared_memory.make_model(running, np.array(position)).state
+            memory.coupling.body.state[:] = state_space.make_body(running, np.array(position)).state
         command(memory, i, position)
         *_, before, _ = tick(memory)
     other = make_spring_mass_model(1, 7).discrete
-    following = shared_memory.make_model(other, np.array(position))
-    settled = following.state.copy()
+    fading = fixed_patch.fade_over(memory.coupling, other, np.array([position]), 0.01)
+    settled = fading.following.state.copy()
     np.testing.assert_allclose(other.dense_a() @ settled + other.b @ np.array(position), settled, atol=1e-15)
 
     image = make_image(memory)
-    fading = memory._replace(next_model=following, fade=np.array([0.0, 0.01]))
-    scheduler.exchange(image, make_image(fading))
+    with_both = shared_memory.with_coupling(memory, fading)
+    scheduler.exchange(image, make_image(with_both))
     forces = [before]
     for i in range(300, 400):
         command(memory, i, position)
-        scheduler.repeat_tick(image, now_ns(memory))
-        forces.append(memory.device_force[0].copy())
-    final = other.c @ settled + other.d @ np.array(position)
+        repeat_tick(image, now_ns(memory))
+        forces.append(newest(memory)["force_n"][0].copy())
+    final = -(other.c @ settled + other.d @ np.array(position))
     np.testing.assert_allclose(forces[-1], final, rtol=1e-9)
     expected = before + np.linspace(0, 1, 101)[:, None] * (final - before)
     np.testing.assert_allclose(forces, expected, rtol=0, atol=1e-6 * np.abs(final).max())
 
-    done = memory._replace(model=following, snapshot_state=np.zeros(other.order))
+    done = shared_memory.with_coupling(memory, fixed_patch.faded_over(fading))
     scheduler.exchange(image, make_image(done))
     command(memory, 400, position)
-    scheduler.repeat_tick(image, now_ns(memory))
-    np.testing.assert_allclose(memory.device_force[0], final, rtol=1e-9)
+    repeat_tick(image, now_ns(memory))
+    np.testing.assert_allclose(newest(memory)["force_n"][0], final, rtol=1e-9)
+
+
+def arrive(memory: shared_memory.Memory, sequence: int, arrival_ns: int, depth_m: float = 0.0) -> int:
+    """A command comes at this time; the ticks that ran, or minus the reason."""
+    lease = memory.commands.lease[0]
+    memory.commands.incoming[0] = (0, lease, sequence, 7, arrival_ns, -1, (0.0, 0.0, depth_m), STILL)
+    return int(scheduler.arrive(make_image(memory), 1))
 
 
 def test_an_early_command_waits_for_the_tick_and_a_second_one_replaces_it(
@@ -522,85 +557,105 @@ def test_an_early_command_waits_for_the_tick_and_a_second_one_replaces_it(
 ) -> None:
     now = time.monotonic_ns()
     memory.shared[shared_memory.DEADLINE_NS] = now + PERIOD_NS - 100_000
-    command(memory, 1, (0.0, 0.0, 1e-3))
-    assert scheduler.tick_on_arrival(make_image(memory), now) == 0
-    command(memory, 2, (0.0, 0.0, 2e-3))
-    assert scheduler.tick_on_arrival(make_image(memory), now + PERIOD_NS * 6 // 10) == 1
-    assert memory.record_inputs[0, 0, shared_memory.SEQUENCE] == 2
-    assert (
-        scheduler.tick_on_arrival(make_image(memory), now + PERIOD_NS * 7 // 10) == 0
-    )  # one tick each period
+    assert arrive(memory, 1, now, 1e-3) == 0
+    assert arrive(memory, 2, now + PERIOD_NS * 6 // 10, 2e-3) == 1
+    assert memory.ring.ports["sequence"][0, 0] == 2
+    assert arrive(memory, 3, now + PERIOD_NS * 7 // 10) == 0  # one tick each period
+
+
+@pytest.mark.parametrize(
+    ("sequence", "depth_m", "reason"),
+    [
+        (5, 0.0, "old_sequence"),
+        (6, float("nan"), "not_finite"),
+        (6, float("-inf"), "not_finite"),
+        (6, 1000.1, "out_of_range"),
+    ],
+)
+def test_a_command_is_refused_for_its_numbers_and_leaves_nothing_behind(
+    memory: shared_memory.Memory, sequence: int, depth_m: float, reason: str
+) -> None:
+    now = time.monotonic_ns()
+    memory.shared[shared_memory.DEADLINE_NS] = now + PERIOD_NS
+    assert arrive(memory, 5, now, 1e-3) == 0
+    before = memory.commands.newest.copy()
+    assert scheduler.REFUSALS[-arrive(memory, sequence, now + PERIOD_NS, depth_m)] == reason
+    assert memory.commands.newest.tobytes() == before.tobytes()
+    assert memory.counters["ticks"][0] == 0
+    scheduler.forget_command(memory.commands, 0)
+    assert arrive(memory, 5, now, 1e-3) == 0  # in the next hold a client may count anew
 
 
 def test_deadlines_settle_a_quarter_of_a_period_behind_steady_arrivals(memory: shared_memory.Memory) -> None:
     start = time.monotonic_ns()
+    sequence = 0
     for offset in (0, 170_000, 480_000, 730_000, 999_000):
         memory.shared[shared_memory.DEADLINE_NS] = start + offset
         ticks = 0
         for i in range(600):
-            ticks += scheduler.tick_on_arrival(make_image(memory), start + i * PERIOD_NS)
+            sequence += 1
+            ticks += arrive(memory, sequence, start + i * PERIOD_NS)
         phase = (memory.shared[shared_memory.DEADLINE_NS] - start) % PERIOD_NS
         assert abs(phase - PERIOD_NS // 4) < PERIOD_NS // 50
         assert abs(ticks - 600) <= 1
 
 
 def test_a_burst_moves_the_deadlines_no_more_than_one_command_does(memory: shared_memory.Memory) -> None:
-    image = make_image(memory)
     now = time.monotonic_ns()
     memory.shared[shared_memory.DEADLINE_NS] = now + PERIOD_NS * 7 // 10  # too early for the tick to run
-    for _ in range(100):
-        assert scheduler.tick_on_arrival(image, now) == 0
+    for sequence in range(100):
+        assert arrive(memory, sequence, now) == 0
     assert memory.shared[shared_memory.DEADLINE_NS] == now + PERIOD_NS * 7 // 10 - 2_000
 
 
 def test_a_released_tissue_comes_to_rest_exactly_and_a_touch_ends_that(memory: shared_memory.Memory) -> None:
-    assert memory.counters[shared_memory.AT_REST_SINCE] == 0
+    assert memory.counters["at_rest_since"][0] == 0
     for i in range(300):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
-        assert memory.counters[shared_memory.AT_REST_SINCE] == -1
+        assert memory.counters["at_rest_since"][0] == -1
     scheduler.forget_command(memory.commands, 0)
     for _ in range(20_000):
         tick(memory)
-        if memory.counters[shared_memory.AT_REST_SINCE] >= 0:
+        if memory.counters["at_rest_since"][0] >= 0:
             break
-        assert np.any(memory.model.state)
-    np.testing.assert_array_equal(memory.model.state, 0)
-    ticks = int(memory.counters[shared_memory.TICKS])
-    assert memory.counters[shared_memory.AT_REST_SINCE] == ticks
-    np.testing.assert_array_less(np.abs(memory.record_motion[ticks - 500 : ticks, 0, 3:6]), 1e-9)
+        assert np.any(memory.coupling.body.state)
+    np.testing.assert_array_equal(memory.coupling.body.state, 0)
+    ticks = int(memory.counters["ticks"][0])
+    assert memory.counters["at_rest_since"][0] == ticks
+    np.testing.assert_array_less(np.abs(memory.ring.ports["force_n"][ticks - 500 : ticks]), 1e-9)
     tick(memory)
-    np.testing.assert_array_equal(memory.model.state, 0)
-    assert memory.counters[shared_memory.AT_REST_SINCE] == ticks
+    np.testing.assert_array_equal(memory.coupling.body.state, 0)
+    assert memory.counters["at_rest_since"][0] == ticks
     command(memory, 300, (0.0, 0.0, 1e-3))
     tick(memory)
-    assert memory.counters[shared_memory.AT_REST_SINCE] == -1
+    assert memory.counters["at_rest_since"][0] == -1
 
 
 def test_ticks_with_a_client_and_those_with_a_new_command_are_counted(memory: shared_memory.Memory) -> None:
     tick(memory)
-    np.testing.assert_array_equal(memory.tallies, [[0, 0]])
+    assert tallies(memory) == [0, 0]
     for i in range(10):
         command(memory, i, (0.0, 0.0, 0.0))
         tick(memory)
         tick(memory)  # without a new one
-    np.testing.assert_array_equal(memory.tallies, [[20, 10]])
+    assert tallies(memory) == [20, 10]
     scheduler.forget_command(memory.commands, 0)
     tick(memory)
-    np.testing.assert_array_equal(memory.tallies, [[20, 10]])
+    assert tallies(memory) == [20, 10]
 
 
 def test_missed_ticks_are_made_up_for_and_too_many_are_skipped(memory: shared_memory.Memory) -> None:
     now = time.monotonic_ns()
     memory.shared[shared_memory.DEADLINE_NS] = now - 5 * PERIOD_NS - PERIOD_NS // 2
-    assert scheduler.tick_on_arrival(make_image(memory), now) == 6
-    assert memory.counters[shared_memory.CAUGHT_UP_TICKS] == 5
-    flags = memory.record_inputs[:6, 0, shared_memory.CONTACT_FLAGS]
+    assert arrive(memory, 1, now) == 6
+    assert memory.counters["caught_up_ticks"][0] == 5
+    flags = memory.ring.ports["flags"][:6, 0]
     np.testing.assert_array_equal(flags & int(Flags.CAUGHT_UP) > 0, [True] * 5 + [False])
 
     memory.shared[shared_memory.DEADLINE_NS] = now - 100 * PERIOD_NS - PERIOD_NS // 2
-    assert scheduler.tick_on_arrival(make_image(memory), now) == scheduler.MAX_CATCH_UP
-    assert memory.counters[shared_memory.SKIPPED_TICKS] == 101 - scheduler.MAX_CATCH_UP
+    assert arrive(memory, 2, now) == scheduler.MAX_CATCH_UP
+    assert memory.counters["skipped_ticks"][0] == 101 - scheduler.MAX_CATCH_UP
     assert 0 < memory.shared[shared_memory.DEADLINE_NS] - now < PERIOD_NS
 
 
@@ -616,7 +671,7 @@ def test_the_deadline_loop_steps_once_each_period_of_wall_time(
     scheduler.stop(memory.shared)
     thread.join()
     stopped = memory.shared[shared_memory.DEADLINE_NS]  # of the first tick that did not run
-    ticks = memory.counters[shared_memory.TICKS] + memory.counters[shared_memory.SKIPPED_TICKS]
+    ticks = memory.counters["ticks"][0] + memory.counters["skipped_ticks"][0]
     assert ticks == (stopped - start) // PERIOD_NS
     assert stopped - time.monotonic_ns() <= PERIOD_NS
     os.close(wake)
@@ -624,8 +679,8 @@ def test_the_deadline_loop_steps_once_each_period_of_wall_time(
 
 def wait_for_ticks(memory: shared_memory.Memory, count: int) -> None:
     give_up = time.monotonic() + 120  # the first one may have to be compiled
-    while memory.counters[shared_memory.TICKS] < count:
-        assert time.monotonic() < give_up, f"{memory.counters[shared_memory.TICKS]} ticks of {count}"
+    while memory.counters["ticks"][0] < count:
+        assert time.monotonic() < give_up, f"{memory.counters['ticks'][0]} ticks of {count}"
         time.sleep(0.005)
 
 
@@ -638,82 +693,52 @@ def test_the_deadline_loop_goes_on_while_python_is_busy(
     memory.shared[shared_memory.DEADLINE_NS] = time.monotonic_ns()
     thread.start()
     wait_for_ticks(memory, 1)
-    before = int(memory.counters[shared_memory.TICKS])
+    before = int(memory.counters["ticks"][0])
     sum(range(50_000_000))  # one call that holds the GIL for a second
-    assert memory.counters[shared_memory.TICKS] - before > 100
+    assert memory.counters["ticks"][0] - before > 100
     scheduler.stop(memory.shared)
     thread.join()
     os.close(wake)
 
 
 @njit(nogil=True)
-def _write_pairs(commands: shared_memory.Commands, n: int) -> None:
-    for i in range(n):
-        pair = (float(i), float(i), float(i))
-        scheduler.write_command(commands, 0, i, i, i, -1, 0, pair, pair)
-
-
-@njit(nogil=True)
-def _count_torn(commands: shared_memory.Commands, n: int) -> tuple[int, int]:
-    torn = whole = 0
-    for _ in range(n):
-        version = atomics.begin_read(commands.versions, 0)
-        sequence = commands.integers[shared_memory.NEWEST, 0, 0]
-        arrival = commands.integers[shared_memory.NEWEST, 0, 2]
-        x, z = commands.motion[shared_memory.NEWEST, 0, 0], commands.motion[shared_memory.NEWEST, 0, 2]
-        if atomics.is_whole(commands.versions, 0, version):
-            whole += 1
-            if not (sequence == arrival and x == z and x == float(sequence)):
-                torn += 1
-    return torn, whole
-
-
-def test_a_reader_never_sees_half_a_command(memory: shared_memory.Memory) -> None:
-    _write_pairs(memory.commands, 1)
-    _count_torn(memory.commands, 1)
-    writer = threading.Thread(target=_write_pairs, args=(memory.commands, 20_000_000))
-    writer.start()
-    torn, whole = 0, 0
-    while writer.is_alive():
-        more_torn, more_whole = _count_torn(memory.commands, 100_000)
-        torn, whole = torn + more_torn, whole + more_whole
-    writer.join()
-    assert whole > 1000
-    assert torn == 0
-
-
-@njit(nogil=True)
-def _write_to_both(commands: shared_memory.Commands, first: int, stop: int) -> None:
+def _write_to_all(image: Image, incoming: np.ndarray, first: int, stop: int) -> None:
+    """Messages for all tools, every number of which is the sequence."""
     for i in range(first, stop):
-        now = monotonic_ns()
-        there = (0.0, 0.0, 1e-3 * (i % 2))
-        scheduler.stage_command(commands, 1, i, 7, now, -1, 0, there, there)
-        scheduler.write_command(commands, 0, i, 7, now, -1, 0, there, there)
+        for tool in range(incoming.shape[0]):
+            command = incoming[tool]
+            command.tool = tool
+            command.sequence = command.arrival_ns = i
+            for j in range(3):
+                command.position_m[j] = command.velocity_m_per_s[j] = i * 1e-9
+        scheduler.hand_over(image, incoming.shape[0])
 
 
 @njit(nogil=True)
 def _run_ticks(image: Image, n: int) -> None:
     for _ in range(n):
-        scheduler.repeat_tick(image, monotonic_ns())
+        now = monotonic_ns()
+        scheduler.repeat_tick(image, now, now, False)
 
 
-def test_no_tick_comes_between_two_contacts_of_a_command(
+def test_no_tick_sees_half_a_message_of_several_tools(
     make_spring_mass_model: Callable[..., ReducedModel],
 ) -> None:
     model = make_spring_mass_model(2)
     memory = shared_memory.make_memory(model.discrete, model.period_s, [FREE, FREE], 1 / 30)
     image = make_image(memory)
-    _write_to_both(memory.commands, 0, 1)
+    incoming = memory.commands.incoming
+    _write_to_all(image, incoming, 0, 1)
     _run_ticks(image, 1)
     enough = threading.Event()
 
-    def write() -> None:
+    def write_on() -> None:
         first = 1
         while not enough.is_set():
-            _write_to_both(memory.commands, first, first + 10_000)
+            _write_to_all(image, incoming, first, first + 10_000)
             first += 10_000
 
-    writer = threading.Thread(target=write, daemon=True)
+    writer = threading.Thread(target=write_on, daemon=True)
     writer.start()
     seen: set[int] = set()
     give_up = time.monotonic() + 60
@@ -721,39 +746,16 @@ def test_no_tick_comes_between_two_contacts_of_a_command(
         while len(seen) < 1000:
             assert time.monotonic() < give_up
             _run_ticks(image, 1000)
-            rows = (scheduler.records_written(memory.shared) - 1 - np.arange(1000)) % shared_memory.RECORDS
-            sequences = memory.record_inputs[rows, :, shared_memory.SEQUENCE]
-            np.testing.assert_array_equal(sequences[:, 0], sequences[:, 1])
-            np.testing.assert_array_equal(memory.newest_integers[0], memory.newest_integers[1])
-            np.testing.assert_array_equal(memory.target[0], memory.target[1])
-            seen |= set(sequences[:, 0].tolist())
+            rows = (scheduler.records_written(memory.shared) - 1 - np.arange(1000)) % RECORDS
+            ports = memory.ring.ports[rows]
+            np.testing.assert_array_equal(ports["sequence"][:, 0], ports["sequence"][:, 1])
+            for name in ("target_m", "velocity_m_per_s"):
+                expected = np.broadcast_to(ports["sequence"][..., None] * 1e-9, ports[name].shape)
+                np.testing.assert_array_equal(ports[name], expected)
+            seen |= set(ports["sequence"][:, 0].tolist())
     finally:
         enough.set()
         writer.join()
-
-
-def test_a_command_that_is_staged_waits_for_the_rest_and_for_a_lease_that_still_holds(
-    make_spring_mass_model: Callable[..., ReducedModel],
-) -> None:
-    model = make_spring_mass_model(2)
-    memory = shared_memory.make_memory(model.discrete, model.period_s, [FREE, FREE], 1 / 30)
-    image, still = make_image(memory), (0.0, 0.0, 0.0)
-
-    def sequences() -> list[int]:
-        scheduler.repeat_tick(image, time.monotonic_ns())
-        row = (scheduler.records_written(memory.shared) - 1) % shared_memory.RECORDS
-        return list(memory.record_inputs[row, :, shared_memory.SEQUENCE])
-
-    scheduler.stage_command(memory.commands, 0, 1, 7, 1, -1, 0, still, still)
-    assert sequences() == [-1, -1]
-    scheduler.write_command(memory.commands, 1, 1, 7, 1, -1, 0, still, still)
-    assert sequences() == [1, 1]
-    scheduler.write_command(memory.commands, 1, 2, 7, 1, -1, 0, still, still)
-    assert sequences() == [1, 2]  # what was staged once is handed over once
-    scheduler.stage_command(memory.commands, 0, 3, 7, 1, -1, 0, still, still)
-    scheduler.forget_command(memory.commands, 0)
-    scheduler.write_command(memory.commands, 1, 3, 7, 1, -1, 0, still, still)
-    assert sequences() == [-1, 3]
 
 
 def test_a_snapshot_belongs_to_one_tick(make_spring_mass_model: Callable[..., ReducedModel]) -> None:
@@ -777,12 +779,12 @@ def test_a_force_that_is_no_number_never_reaches_the_device_and_the_next_client_
     image = make_image(memory)
     broken = np.array(FREE._replace(max_damping_n_s_per_m=float("nan")))
     scheduler.set_limits(image, 0, broken)
-    faults = memory.counters[shared_memory.FAULTS]
+    faults = memory.counters["faults"][0]
     for i in range(300):
         command(memory, i, (1e-3 * np.sin(0.3 * i), 0.0, 0.0))
         _, _, force, _ = tick(memory)
         assert np.all(np.isfinite(force))
-    seen = memory.counters[shared_memory.FAULTS] - faults
+    seen = memory.counters["faults"][0] - faults
     assert seen > 0
     scheduler.set_limits(image, 0, np.array(FREE))
     for i in range(300, 600):

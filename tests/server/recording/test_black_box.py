@@ -13,50 +13,44 @@ from palpate.model_file import ReducedModel
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import HOLD_NS, Limits
+from palpate_server.realtime.shared_memory import Memory
 from palpate_server.recording import black_box
 from palpate_server.recording.black_box import BlackBox
 
 PERIOD_NS = 1_000_000
 
 
-def run(memory: shared_memory.Memory, ticks: int, depth_m: float, first: int = 0) -> None:
+def run(memory: Memory, ticks: int, depth_m: float, first: int = 0) -> None:
     image = make_image(memory)
+    lease = int(memory.commands.lease[0])
     for i in range(first, first + ticks):
         now = time.monotonic_ns()
         memory.shared[shared_memory.DEADLINE_NS] = now + PERIOD_NS // 4
-        scheduler.write_command(
-            memory.commands,
-            0,
-            i,
-            7,
-            now,
-            -1,
-            int(memory.commands.lease[0]),
-            (0.0, 0.0, depth_m),
-            (0.0, 0.0, 0.0),
-        )
-        scheduler.tick_on_arrival(image, now)
+        position, still = (0.0, 0.0, depth_m), (0.0, 0.0, 0.0)
+        memory.commands.incoming[0] = (0, lease, i, 7, now, -1, position, still)
+        assert scheduler.arrive(image, 1) == 1
 
 
-def silence(memory: shared_memory.Memory, ticks: int, *, released: bool = False) -> None:
-    """Ticks after the client has fallen silent, or has released its contact."""
+def silence(memory: Memory, ticks: int, *, released: bool = False) -> None:
+    """Ticks after the client has fallen silent, or has released its tool."""
     image = make_image(memory)
     if released:
         scheduler.forget_command(memory.commands, 0)
     silent_ns = time.monotonic_ns() + (0 if released else HOLD_NS)
     for i in range(1, ticks + 1):
-        scheduler.repeat_tick(image, silent_ns + i * PERIOD_NS)
+        now = silent_ns + i * PERIOD_NS
+        scheduler.repeat_tick(image, now, now, False)
 
 
 @pytest.fixture
-def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> shared_memory.Memory:
+def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> Memory:
     model = make_spring_mass_model()
     return shared_memory.make_memory(
         model.discrete, model.period_s, [Limits(0.01, 1e9, 1e6, 1.0, 0.0)], 1 / 30
     )
 
 
-def test_nothing_is_written_while_all_is_well(memory: shared_memory.Memory, tmp_path: Path) -> None:
+def test_nothing_is_written_while_all_is_well(memory: Memory, tmp_path: Path) -> None:
     box = BlackBox(tmp_path, "s", ["tip"], memory)
     silence(memory, 10)  # nobody has come yet: stale, but no event
     assert box.examine() is None
@@ -67,9 +61,7 @@ def test_nothing_is_written_while_all_is_well(memory: shared_memory.Memory, tmp_
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_stale_input_is_written_once_with_the_ticks_before_it(
-    memory: shared_memory.Memory, tmp_path: Path
-) -> None:
+def test_a_stale_input_is_written_once_with_the_ticks_before_it(memory: Memory, tmp_path: Path) -> None:
     box = BlackBox(tmp_path / "new", "s", ["tip"], memory)
     run(memory, 2500, 1e-9)
     assert box.examine() is None
@@ -79,17 +71,17 @@ def test_a_stale_input_is_written_once_with_the_ticks_before_it(
     writing.join()
     (path,) = (tmp_path / "new").glob("palpate-s-*-stale.npz")
     with np.load(path, allow_pickle=False) as file:
-        assert file["contacts"].tolist() == ["tip"]
-        np.testing.assert_array_equal(file["tick"], np.arange(600, 2600))
-        np.testing.assert_array_equal(file["sequence"][:1900, 0], np.arange(600, 2500))
-        assert file["force_n"].shape == (2000, 1, 3)
+        assert file["tools"].tolist() == ["tip"]
+        np.testing.assert_array_equal(file["ticks"]["tick"], np.arange(600, 2600))
+        np.testing.assert_array_equal(file["ports"]["sequence"][:1900, 0], np.arange(600, 2500))
+        assert file["ports"]["force_n"].shape == (2000, 1, 3)
     run(memory, 100, 1e-9, first=3000)
     silence(memory, 100)
     assert box.examine() is None  # too soon after the last one
 
 
 def test_a_lost_client_is_written_once_and_files_come_to_an_end(
-    memory: shared_memory.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    memory: Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(black_box, "QUIET_S", 0.0)
     box = BlackBox(tmp_path, "s", ["tip"], memory)
@@ -104,7 +96,7 @@ def test_a_lost_client_is_written_once_and_files_come_to_an_end(
     assert len(list(tmp_path.glob("*-lost.npz"))) == black_box.MOST_FILES
 
 
-def test_a_fault_and_a_storm_of_limits_are_named(memory: shared_memory.Memory, tmp_path: Path) -> None:
+def test_a_fault_and_a_storm_of_limits_are_named(memory: Memory, tmp_path: Path) -> None:
     box = BlackBox(tmp_path, "s", ["tip"], memory)
     run(memory, 1500, 1e-2)  # beyond the force limit all the time
     writing = box.examine()
@@ -112,7 +104,7 @@ def test_a_fault_and_a_storm_of_limits_are_named(memory: shared_memory.Memory, t
     writing.join()
     assert len(list(tmp_path.glob("*-limits.npz"))) == 1
 
-    memory.model.state[0] = np.nan  # right after: a fault is not lost because of what came before it
+    memory.coupling.body.state[0] = np.nan  # right after: a fault is not lost because of what came before it
     run(memory, 5, 0.0, first=2000)
     writing = box.examine()
     assert writing is not None
@@ -121,7 +113,7 @@ def test_a_fault_and_a_storm_of_limits_are_named(memory: shared_memory.Memory, t
 
 
 def test_a_folder_that_cannot_be_written_is_only_a_warning(
-    memory: shared_memory.Memory, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    memory: Memory, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("")
     box = BlackBox(tmp_path / "file", "s", ["tip"], memory)

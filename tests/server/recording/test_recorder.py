@@ -3,263 +3,227 @@
 from __future__ import annotations
 
 import resource
-import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
 import pytest
-from mcap.reader import NonSeekingReader, make_reader
+from mcap.reader import make_reader
 
-from palpate.model_file import ReducedModel
-from palpate_server import wire
-from palpate_server.realtime import scheduler, shared_memory
-from palpate_server.realtime.native_image import make_image
-from palpate_server.realtime.safety import Limits
+from palpate_client.wire import Keys
+from palpate_server.realtime.records import RECORDS
 from palpate_server.recording import recorder, replay
-from palpate_server.recording.mcap_file import from_json
 from palpate_server.recording.recorder import Recorder
 from palpate_server.session.leases import Refused
 
-KEYS = wire.Keys("test")
-DESCRIPTION = {"session": "test", "period_s": 1e-3}
+Loop = Any
 
 
-@pytest.fixture
-def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> shared_memory.Memory:
-    model = make_spring_mass_model()
-    return shared_memory.make_memory(
-        model.discrete, model.period_s, [Limits(1.0, 1e9, 1e6, 1.0, 0.0)], 1 / 30
-    )
-
-
-def command(sequence: int) -> bytes:
-    return msgpack.packb(
-        {"sequence": sequence, "client_time_ns": 7, "displacement_m": {"tip": [0.0, 0.0, 1e-4]}}
-    )
-
-
-def run(recording: Recorder, memory: shared_memory.Memory, ticks: int) -> None:
-    """Ticks with a command before each, as fast as they come."""
-    image = make_image(memory)
-    for _ in range(ticks):
-        tick = int(memory.counters[shared_memory.TICKS])
-        recording.command(KEYS.command("c"), command(tick))
-        now = time.monotonic_ns()
-        scheduler.write_command(memory.commands, 0, tick, 7, now, -1, 0, (0.0, 0.0, 1e-4), (0.0, 0.0, 0.0))
-        scheduler.repeat_tick(image, now)
-
-
-def run_until_an_error(recording: Recorder, memory: shared_memory.Memory) -> None:
-    give_up = time.monotonic() + 60.0
-    while recording.report()["error"] is None:
+def wait_for(condition: Callable[[], Any]) -> None:
+    give_up = time.monotonic() + 120.0
+    while not condition():
         assert time.monotonic() < give_up
-        run(recording, memory, 100)
+        time.sleep(0.02)
+
+
+def run_until_an_error(loop: Loop) -> None:
+    give_up = time.monotonic() + 120.0
+    while loop.recorder.report()["error"] is None:
+        assert time.monotonic() < give_up
+        loop.run(100)
         time.sleep(0.01)
 
 
-@pytest.fixture
-def patiently(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the end of a recording the process that writes may still be starting, on a busy machine."""
-    monkeypatch.setattr(recorder, "_END_S", 60.0)
-
-
-def messages(path: Path) -> list[tuple[str, int, dict[str, Any]]]:
-    with path.open("rb") as stream:
-        return [
-            (kind, message.log_time, from_json(kind, message.data))
-            for schema, _, message in NonSeekingReader(stream).iter_messages(log_time_order=False)
-            if schema is not None and (kind := schema.name.removeprefix("palpate."))
-        ]
-
-
-@pytest.mark.usefixtures("patiently")
-def test_commands_and_ticks_are_all_in_the_file_each_command_before_its_tick(
-    memory: shared_memory.Memory, tmp_path: Path
-) -> None:
-    path = tmp_path / "a.mcap"
-    began_ns = time.time_ns()
-    recording = Recorder(path, KEYS, DESCRIPTION, memory)
-    for _ in range(10):
-        run(recording, memory, 100)
-        recording.status(wire.pack({"state": "running", "ticks": int(memory.counters[shared_memory.TICKS])}))
-        time.sleep(0.02)  # so that it is written in several portions
-    recording.stop()
-    assert recording.report() == {"file": "a.mcap", "messages": 2011, "missing_ticks": 0, "error": None}
-
+def message_count(path: Path) -> int:
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
     assert summary.statistics is not None
-    assert summary.statistics.message_count == 2011
-    written = messages(path)
-    assert [kind for kind, _, _ in written].count("status") == 10
-    assert written[0][0] == "describe"
-    times = [time_ns for _, time_ns, _ in written]
-    assert times == sorted(times)
-    assert began_ns - 10**9 < times[0] <= times[-1] < time.time_ns() + 10**9
-    order = [
-        (kind, message["sequence"])
-        for kind, _, message in written
-        if kind in ("command", "force") and (kind == "command" or message["sequence"][0] >= 0)
-    ]
-    assert order == [step for i in range(1000) for step in (("command", i), ("force", [i]))]
-    ticks = {m["tick"]: m for kind, _, m in written if kind == "force"}
-    assert list(ticks) == list(range(1000))
-    for tick in (0, 500, 999):
-        np.testing.assert_array_equal(ticks[tick]["force_n"], memory.record_motion[tick, :, 3:6])
+    return summary.statistics.message_count
 
 
 @pytest.mark.usefixtures("patiently")
-def test_what_is_recorded_is_soon_in_the_file(memory: shared_memory.Memory, tmp_path: Path) -> None:
+def test_every_tick_is_in_the_file_and_the_report_counts_its_messages(loop: Loop, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    loop.run(10)
+    recording = loop.record(path)
+    for _ in range(10):
+        loop.run(100)
+        loop.status()
+        time.sleep(0.02)  # so that it is written in several portions
+    recording.stop()
+    # A description, the state at the beginning, ten statuses and the ticks.
+    report = {"file": "a.mcap", "messages": 1012, "missing_ticks": 0, "error": None}
+    assert recording.report() == report
+    assert message_count(path) == 1012
+    recorded = replay.read_recording(path)
+    np.testing.assert_array_equal(recorded.ticks["tick"], np.arange(10, 1010))
+    assert recorded.ports.tobytes() == loop.memory.ring.ports[10:1010].tobytes()
+    assert list(recorded.settings) == [10]
+
+
+@pytest.mark.usefixtures("patiently")
+def test_what_is_recorded_is_soon_in_the_file(loop: Loop, tmp_path: Path) -> None:
     """A crash of the machine would lose the rest."""
-
-    def forces() -> int:
-        try:
-            return len(replay.read_session(tmp_path / "a.mcap").forces)
-        except replay.ReplayError:  # nothing yet
-            return 0
-
-    recording = Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)
-    run(recording, memory, 300)
-    give_up = time.monotonic() + 60.0
-    while forces() < 100:
-        assert time.monotonic() < give_up
-        time.sleep(0.05)
+    recording = loop.record(tmp_path / "a.mcap")
+    loop.run(500)
+    wait_for(lambda: recording.report()["messages"] > 100)
+    assert len(replay.read_recording(tmp_path / "a.mcap").ticks) > 100
     recording.stop()
 
 
 @pytest.mark.usefixtures("patiently")
-def test_ticks_that_were_overwritten_before_they_were_taken_are_counted(
-    memory: shared_memory.Memory,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
+def test_ticks_that_were_overwritten_before_they_were_taken_are_counted_and_a_new_state_follows(
+    loop: Loop, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorder, "_PERIOD_S", 60.0)  # it looks once, at the end
-    recording = Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)
-    run(recording, memory, shared_memory.RECORDS + 99)
+    monkeypatch.setattr(recorder, "PERIOD_S", 1e6)  # it looks once, at the end
+    recording = loop.record(tmp_path / "a.mcap")
+    recording._collect()  # the first state
+    loop.run(RECORDS + 99)
+    recording._collect()
+    loop.run(10)
     recording.stop()
     # One more than the 99: the oldest row is the one that the next tick writes to.
     assert recording.report()["missing_ticks"] == 100
     assert "100 ticks" in caplog.text
-    ticks = [m["tick"] for kind, _, m in messages(tmp_path / "a.mcap") if kind == "force"]
-    assert ticks == list(range(100, shared_memory.RECORDS + 99))
+    recorded = replay.read_recording(tmp_path / "a.mcap")
+    assert recorded.ticks["tick"].tolist() == list(range(100, RECORDS + 109))
+    assert list(recorded.settings) == [RECORDS + 99]
+
+
+@pytest.fixture
+def small_files() -> Iterator[Callable[[int], None]]:
+    """Limits the size of files of the processes that are started from now on: to them, the disk is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.usefixtures("patiently")
-def test_a_full_disk_ends_the_recording_with_its_reason_and_what_was_written_is_readable(
-    memory: shared_memory.Memory, tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_a_full_disk_ends_the_recording_and_the_report_counts_what_is_in_the_file(
+    loop: Loop, tmp_path: Path, caplog: pytest.LogCaptureFixture, small_files: Callable[[int], None]
 ) -> None:
     path = tmp_path / "a.mcap"
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, before[1]))  # the process inherits it
-        recording = Recorder(path, KEYS, DESCRIPTION, memory)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    run_until_an_error(recording, memory)
+    small_files(200_000)
+    recording = loop.record(path)
+    run_until_an_error(loop)
     assert recording.report()["error"] == "File too large"
     assert "a.mcap has ended: File too large" in caplog.text
-    counted = recording.messages
-    run(recording, memory, 10)  # the server goes on
+    loop.run(10)  # the server goes on
     recording.stop()
-    assert recording.messages == counted
     assert path.stat().st_size <= 200_000
-    assert len(replay.read_session(path).forces) > 1000
+    recorded = replay.read_recording(path)
+    assert recording.report()["messages"] == len(recorded.ticks) + len(recorded.settings) + 1
+    assert len(recorded.ticks) > 300
+    assert replay.compare(recorded, [loop.model]).difference is None
 
 
-def test_a_process_that_no_longer_takes_anything_ends_the_recording_and_nobody_waits_for_it(
-    memory: shared_memory.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorder, "_MAX_UNWRITTEN", 100_000)
-    monkeypatch.setattr(sys, "executable", str(_script(tmp_path, "exec sleep 30")))
-    recording = Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)
-    run_until_an_error(recording, memory)
-    assert recording.report()["error"] == "it can't be written as fast as it comes"
-    recording._process.kill()
-    recording._process.wait()
-
-
-def test_what_is_not_taken_in_time_at_the_end_is_an_error(
-    memory: shared_memory.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorder, "_END_S", 0.3)
-    monkeypatch.setattr(sys, "executable", str(_script(tmp_path, "exec sleep 30")))
-    recording = Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)
-    run(recording, memory, 1000)
+@pytest.mark.usefixtures("patiently")
+def test_a_recording_ends_complete_where_its_folder_is_full(loop: Loop, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    recording = loop.record(path, 600_000)
+    run_until_an_error(loop)
     recording.stop()
-    assert recording.report()["error"] == "it can't be written as fast as it comes"
-    recording._process.kill()
-    recording._process.wait()
+    assert "holds as much as it may" in str(recording.report()["error"])
+    assert path.stat().st_size <= 600_000
+    assert message_count(path) == recording.report()["messages"]
 
 
-def test_a_process_that_dies_is_named_with_how_it_ended(
-    memory: shared_memory.Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "executable", str(_script(tmp_path, "exit 3")))
-    recording = Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)
-    recording._process.wait()
-    run(recording, memory, 10)
-    recording.stop()
-    assert recording.report()["error"] == "its process ended with code 3"
+def test_a_folder_that_is_full_takes_no_more_recordings(tmp_path: Path) -> None:
+    (tmp_path / "old.mcap").write_bytes(bytes(10))
+    assert recorder.room_in(tmp_path, 2 * recorder.LEAST_BYTES) == 2 * recorder.LEAST_BYTES - 10
+    with pytest.raises(Refused, match="remove old recordings") as refusal:
+        recorder.room_in(tmp_path, recorder.LEAST_BYTES)
+    assert refusal.value.reason == "full"
 
 
-def _script(folder: Path, line: str) -> Path:
+def fake_process(monkeypatch: pytest.MonkeyPatch, folder: Path, line: str) -> None:
     script = folder / "script"
     script.write_text(f"#!/bin/sh\n{line}\n")
     script.chmod(0o755)
-    return script
+    monkeypatch.setattr(sys, "executable", str(script))
 
 
-def test_an_existing_file_is_left_alone(memory: shared_memory.Memory, tmp_path: Path) -> None:
+def test_a_process_that_no_longer_takes_anything_ends_the_recording_and_nobody_waits_for_it(
+    loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "MAX_UNWRITTEN_BYTES", 100_000)
+    fake_process(monkeypatch, tmp_path, "exec sleep 30")
+    recording = loop.record(tmp_path / "a.mcap")
+    run_until_an_error(loop)
+    assert recording.report()["error"] == "it can't be written as fast as it comes"
+
+
+def test_what_is_not_taken_in_time_at_the_end_is_an_error(
+    loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "END_S", 0.3)
+    fake_process(monkeypatch, tmp_path, "exec sleep 30")
+    recording = loop.record(tmp_path / "a.mcap")
+    loop.run(1000)
+    recording.stop()
+    assert recording.report()["error"] == "it can't be written as fast as it comes"
+
+
+def test_a_process_that_dies_is_named_with_how_it_ended(
+    loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake_process(monkeypatch, tmp_path, "exit 3")
+    recording = loop.record(tmp_path / "a.mcap")
+    run_until_an_error(loop)
+    recording.stop()
+    assert recording.report()["error"] == "its process ended with code 3"
+    assert recording.report()["messages"] == 0
+
+
+def test_an_existing_file_is_left_alone(loop: Loop, tmp_path: Path) -> None:
+    def refusal_of(path: Path) -> Refused:
+        with pytest.raises(Refused) as refusal:
+            Recorder(path, 10**9, Keys("test"), {}, loop.memory, lambda: None)
+        return refusal.value
+
     (tmp_path / "a.mcap").write_text("kept")
-    with pytest.raises(Refused, match=r"a\.mcap exists") as refusal:
-        Recorder(tmp_path / "a.mcap", KEYS, DESCRIPTION, memory)
-    assert refusal.value.reason == "exists"
+    refused = refusal_of(tmp_path / "a.mcap")
+    assert (refused.reason, str(refused)) == ("exists", "a.mcap exists: expected the name of a new file")
     assert (tmp_path / "a.mcap").read_text() == "kept"
     (tmp_path / "link.mcap").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(Refused, match="exists"):  # a link that leads nowhere yet is not followed
-        Recorder(tmp_path / "link.mcap", KEYS, DESCRIPTION, memory)
+    assert refusal_of(tmp_path / "link.mcap").reason == "exists"  # a link that leads nowhere is not followed
     assert not (tmp_path / "elsewhere").exists()
-    with pytest.raises(Refused, match="No such file") as refusal:
-        Recorder(tmp_path / "missing" / "a.mcap", KEYS, DESCRIPTION, memory)
-    assert refusal.value.reason == "bad_file"
+    assert refusal_of(tmp_path / "missing" / "a.mcap").reason == "bad_file"
 
 
 @pytest.mark.parametrize(
     "name",
     [
-        *(None, 7, ["a.mcap"], "", ".", "..", ".mcap/..", "a", "a.mcap/", "/tmp/a.mcap", "../a.mcap"),
+        *(
+            None,
+            7,
+            ["a.mcap"],
+            "",
+            ".",
+            "..",
+            ".mcap",
+            ".mcap/..",
+            "a",
+            "a.mcap/",
+            "/tmp/a.mcap",
+            "../a.mcap",
+        ),
         *("b/a.mcap", "a\0.mcap", "ä" * 126 + ".mcap", "a" * 10_000 + ".mcap"),
+        *("a\n.mcap", "\x1b[2J.mcap", "a\u202e.mcap", "a\u2066.mcap", "a\x7f.mcap", "a\udc80.mcap"),
     ],
 )
-def test_what_is_no_plain_file_name_is_refused(name: object, tmp_path: Path) -> None:
+def test_what_is_no_plain_printable_name_is_refused(name: object, tmp_path: Path) -> None:
     with pytest.raises(Refused) as refusal:
         recorder.file_in(tmp_path, name)
     assert refusal.value.reason == "bad_file"
     assert len(str(refusal.value)) < 1000
+    assert str(refusal.value).isprintable()
 
 
 def test_a_plain_file_name_is_one_in_the_folder(tmp_path: Path) -> None:
-    for name in ("a.mcap", ".mcap", "a b.mcap", "ä" * 125 + ".mcap"):
+    for name in ("a.mcap", "a b.mcap", "ä" * 125 + ".mcap"):
         assert recorder.file_in(tmp_path, name) == tmp_path / name
-
-
-def test_a_device_that_is_full_ends_the_process_with_one_line() -> None:
-    forces = [msgpack.packb(("status", "k", i, msgpack.packb({"filler": i}))) for i in range(2000)]
-    with Path("/dev/full").open("wb") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "palpate_server.recording.mcap_file"],
-            input=b"".join(forces),
-            stdout=full,
-            stderr=subprocess.PIPE,
-            timeout=60,
-            check=False,
-        )
-    assert done.returncode == 1
-    assert done.stderr.decode().splitlines() == ["No space left on device"]

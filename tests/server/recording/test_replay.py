@@ -1,589 +1,214 @@
-"""Replay: which ticks of a recording can be repeated, and that these are repeated bit for bit."""
+"""Replay: a recording repeats bit for bit whatever happened in it, and a damaged one is refused with one line."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
 import pytest
 
 from palpate.model_file import ReducedModel, save_model
-from palpate_server import wire
-from palpate_server.realtime import scheduler, shared_memory
-from palpate_server.realtime.frames import IDENTITY, Frame
-from palpate_server.realtime.native_image import make_image
-from palpate_server.realtime.safety import HOLD_NS, Flags, Limits
+from palpate_server.realtime import scheduler
+from palpate_server.realtime.records import RECORDS
 from palpate_server.recording import replay
-from palpate_server.recording.mcap_file import Recording
+from palpate_server.recording.replay import Comparison, Recorded
 
-CEILING = Limits(10.0, 2000.0, 1.0, 0.1, 5.0)
-OBSERVED = CEILING._replace(max_damping_n_s_per_m=0.0)  # no passivity control
-SHIFTED = Frame(((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), 2.0, (0.01, -0.02, 0.03))
-
-
-class Recorded:
-    """A loop without a clock or a network, and the recording of it, from tick 0 on; 100 ticks long until now, at rest."""
-
-    def __init__(self, model: ReducedModel) -> None:
-        self.model = model
-        self.memory = shared_memory.make_memory(model.discrete, model.period_s, [CEILING], 1.0)
-        self.image = make_image(self.memory)
-        self.encoder = wire.ForceEncoder(1)
-        self.random = np.random.default_rng(1)
-        self.sequence = 0
-        self.constant_time = False  # of the client
-        self.undisturbed_since = 0
-        self.statuses = 0
-        self.terms: dict[str, Any] = {
-            "limits": CEILING,
-            "frame": IDENTITY,
-            "since_tick": 0,
-            "held_since_tick": 0,
-            "holder": "surgeon",
-        }
-        self.told = {"config_sha256": model.config_sha256, "order": model.order, "name": model.name}
-        self.session = replay.Session(
-            {"contacts": [{"name": "tip"}], "limits": CEILING._asdict(), "model": self.told}
-        )
-        self.run(100)
-
-    @property
-    def tick(self) -> int:
-        return int(self.memory.counters[shared_memory.TICKS])
-
-    @property
-    def at_rest_since(self) -> int:
-        return int(self.memory.counters[shared_memory.AT_REST_SINCE])
-
-    def run(
-        self,
-        ticks: int,
-        commanded: bool = False,
-        rendered_tick: int = -1,
-        by_m: float = 1e-3,
-        to_m: Sequence[float] | None = None,
-    ) -> None:
-        """Some ticks, each with a new command of its own to a place, or to somewhere, or without."""
-        for _ in range(ticks):
-            now = (self.tick + 1) * 1_000_000
-            if commanded:
-                self.sequence += 1
-                away = self.random.normal(size=3) * by_m if to_m is None else np.array(to_m)
-                x, y, z = (np.array(self.terms["frame"].origin_m) + away).tolist()
-                client_time_ns = 0 if self.constant_time else now
-                command = wire.Command(
-                    self.sequence,
-                    client_time_ns,
-                    {"tip": (x, y, z)},
-                    {"tip": (0.01, 0.0, 0.0)},
-                    rendered_tick,
-                )
-                self.hear("surgeon", command)
-                scheduler.write_command(
-                    self.memory.commands,
-                    0,
-                    self.sequence,
-                    client_time_ns,
-                    now,
-                    rendered_tick,
-                    int(self.memory.commands.lease[0]),
-                    (x, y, z),
-                    (0.01, 0.0, 0.0),
-                )
-            scheduler.repeat_tick(self.image, now)
-            row = (self.tick - 1) % shared_memory.RECORDS
-            payload = self.encoder.encode(
-                self.tick - 1, now, self.memory.record_inputs[row], self.memory.record_motion[row]
-            )
-            self.session.forces.append(msgpack.unpackb(payload))
-            if self.tick % 100 == 0:
-                self.say_status()
-
-    def hear(self, client: str, command: wire.Command) -> None:
-        """Have a command in the recording, whether it was accepted or not."""
-        key = client, command.sequence, command.client_time_ns
-        heard = replay.Heard(command, self.tick - 1)
-        self.session.commands.setdefault(key, []).append(heard)
-
-    def lose_command_of(self, message: dict[str, Any]) -> None:
-        """Have the command that a tick used no more in the recording."""
-        del self.session.commands["surgeon", message["sequence"][0], message["client_time_ns"][0]]
-
-    def come_to_rest(self) -> None:
-        scheduler.forget_command(self.memory.commands, 0)
-        self.run(1)
-        for _ in range(200):
-            self.run(100)
-            if self.at_rest_since >= 0:
-                self.say_status()
-                return
-        raise AssertionError("it does not come to rest")
-
-    def agree(self, limits: Limits | None = None, frame: Frame | None = None) -> None:
-        if limits is not None:
-            scheduler.set_limits(self.image, 0, np.array(limits))
-            scheduler.take_up_change(self.image)
-            self.terms |= {"limits": limits, "since_tick": self.tick}
-        if frame is not None:
-            rotation, origin = np.array(frame.rotation), np.array(frame.origin_m)
-            scheduler.set_frame(self.image, 0, rotation, frame.scale, origin)
-            scheduler.take_up_change(self.image)
-            self.terms |= {"frame": frame, "since_tick": self.tick, "held_since_tick": self.tick}
-
-    def reset(self) -> None:
-        scheduler.reset(self.image)
-        scheduler.take_up_change(self.image)
-        self.undisturbed_since = self.tick
-
-    def say_status(self) -> None:
-        told = {"limits": self.terms["limits"]._asdict(), "frame": asdict(self.terms["frame"])}
-        self.statuses += 1
-        self.session.statuses.append(
-            {
-                "number": self.statuses,
-                "ticks": self.tick,
-                "at_rest_since_tick": self.at_rest_since,
-                "undisturbed_since_tick": self.undisturbed_since,
-                "model": self.told,
-                "contacts": {"tip": self.terms | told},
-            }
-        )
-
-    def write(self, recording: Recording) -> None:
-        """The session as messages of an MCAP file."""
-        session = self.session
-        recording.add("describe", "palpate/test/describe", 0, wire.pack(session.description))
-        behind: dict[int, list[tuple[str, wire.Command]]] = {}
-        for (client, *_), all_heard in session.commands.items():
-            for command, after_tick in all_heard:
-                behind.setdefault(after_tick, []).append((client, command))
-        for count, message in enumerate(session.forces):
-            for client, command in behind.get(message["tick"] - 1, ()):
-                content = command._asdict()
-                if command.rendered_tick < 0:
-                    del content["rendered_tick"]
-                recording.add("command", f"palpate/test/command/{client}", count, wire.pack(content))
-            recording.add("force", "palpate/test/force", count, wire.pack(message))
-        for status in session.statuses:
-            recording.add("status", "palpate/test/status", len(session.forces), wire.pack(status))
-        recording.finish()
-
-    def only(self, first: int, last: int | None = None) -> replay.Session:
-        """The recording as if it had been made of these ticks alone."""
-        end = self.tick if last is None else last
-        session = self.session
-        return replay.Session(
-            session.description,
-            {key: heard for key, heard in session.commands.items() if heard[0].after_tick >= first - 1},
-            [message for message in session.forces if first <= message["tick"] < end],
-            [status for status in session.statuses if first <= status["ticks"] <= end],
-        )
+Loop = Any
+ROTATION = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-def repeated(
-    session: replay.Session, *stretches: range, of: int | None = None, lost: int = 0
-) -> replay.Comparison:
-    """Nothing but these ticks, of so many (or of no others), each with the same force."""
-    ticks = [tick for stretch in stretches for tick in stretch]
-    forces = {message["tick"]: message["force_n"][0] for message in session.forces}
-    with_force = sum(any(forces[tick]) for tick in ticks)
-    return replay.Comparison(len(ticks), of or len(ticks), with_force, len(stretches), None, lost)
+def finished(loop: Loop, path: Path) -> Recorded:
+    loop.recorder.stop()
+    assert loop.recorder.report()["error"] is None
+    return replay.read_recording(path)
+
+
+def everything(recorded: Recorded) -> Comparison:
+    """What a comparison gives when all ticks are the same."""
+    n = len(recorded.ticks)
+    return Comparison(n, n, int(np.any(recorded.ports["force_n"], axis=(1, 2)).sum()), 1, None, ())
 
 
 @pytest.fixture
-def recorded(make_spring_mass_model: Callable[..., ReducedModel]) -> Recorded:
-    return Recorded(make_spring_mass_model())
+def eventful(
+    make_loop: Callable[..., Loop],
+    make_spring_mass_model: Callable[..., ReducedModel],
+    tmp_path: Path,
+    patiently: None,
+) -> tuple[Path, list[ReducedModel]]:
+    """A recording of two tools that begins while the tissue moves, with every kind of change in it, and its models."""
+    loop, other = make_loop(2), make_spring_mass_model(2, 7)
+    models = [loop.model, other]
+    path = tmp_path / "a.mcap"
+    loop.run(300)
+    loop.record(path)
+    loop.run(100)
+    loop.run(5, told=200)  # rendered before the recording began
+    loop.change(scheduler.set_limits, 1, np.array([2.0, 500.0, 0.1, 0.01, 2.0]))
+    loop.run(50, by_m=3e-3)
+    scheduler.forget_command(loop.memory.commands, 0)
+    loop.run(1, commanded=False)
+    loop.change(scheduler.set_frame, 0, ROTATION, 0.5, np.array([0.1, 0.2, 0.3]))
+    loop.run(50)
+    loop.run(120, commanded=False)  # silence: held, then faded
+    loop.run(50)
+    loop.load(other)
+    loop.run(50)
+    loop.change(scheduler.reset)
+    loop.run(50)
+    loop.status()
+    loop.recorder.stop()
+    return path, models
 
 
-def test_a_recording_from_the_start_is_repeated_whole(recorded: Recorded) -> None:
-    recorded.agree(Limits(2.0, 100.0, 0.3, 0.05, 1.0), SHIFTED)
-    recorded.run(50)
-    recorded.run(450, commanded=True)
-    recorded.agree(Limits(1.0, 50.0, 0.1, 0.02, 0.0))
-    recorded.run(500, commanded=True)
-    flags = np.bitwise_or.reduce([message["flags"][0] for message in recorded.session.forces])
-    assert flags & int(Flags.SPEED_LIMITED) and flags & int(Flags.SLEW_LIMITED)
-    result = replay.compare(recorded.session, recorded.model)
-    assert result == repeated(recorded.session, range(1100))
-    assert result.with_force > 400
-
-
-def test_a_recording_that_begins_while_the_tissue_moves_is_repeated_from_the_first_known_rest_on(
-    recorded: Recorded,
+def test_whatever_happened_is_repeated_from_the_first_tick_to_the_last(
+    eventful: tuple[Path, list[ReducedModel]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recorded.agree(frame=SHIFTED)
-    recorded.run(300, commanded=True)
-    recorded.come_to_rest()
-    rest = recorded.at_rest_since
-    recorded.run(400 - recorded.tick % 100, commanded=True)
-    session = recorded.only(150)
-    told = min(s["ticks"] for s in session.statuses if s["at_rest_since_tick"] >= 0)
-    assert rest <= told < recorded.tick - 300
-    expected = repeated(session, range(rest, recorded.tick), of=recorded.tick - 150)
-    assert replay.compare(session, recorded.model) == expected
+    path, models = eventful
+    recorded = replay.read_recording(path)
+    assert [settings["change"] for settings in recorded.settings.values()] == [
+        *("save", "limits", "frame", "exchange", "exchange", "reset")
+    ]
+    assert recorded.ticks["tick"][0] == 300
+    assert np.any(recorded.ports["force_n"][:100])
+    assert replay.compare(recorded, models) == everything(recorded)
+
+    files = [tmp_path / "one.npz", tmp_path / "other.npz"]
+    for model, file in zip(models, files, strict=True):
+        save_model(model, file)
+    assert replay.main([str(path), *map(str, files)]) == 0
+    assert "every one is the same, bit for bit" in capsys.readouterr().out
+    assert replay.main([str(path), str(files[0])]) == 3
+    out = capsys.readouterr().out
+    assert "the others could not be compared" in out
+    assert "models that are needed too" in out
+    assert replay.main([str(path), str(files[1])]) == 3
 
 
-def test_a_recording_that_is_nowhere_at_rest_is_refused(recorded: Recorded) -> None:
-    recorded.run(300, commanded=True)
-    with pytest.raises(replay.ReplayError, match="never at rest in this recording: start it before"):
-        replay.compare(recorded.only(150), recorded.model)
-
-
-def test_after_a_lost_message_the_next_rest_begins_another_stretch(recorded: Recorded) -> None:
-    recorded.run(300, commanded=True)
-    recorded.come_to_rest()
-    rest = recorded.at_rest_since
-    recorded.run(400 - recorded.tick % 100, commanded=True)
-    del recorded.session.forces[200]
-    expected = repeated(recorded.session, range(200), range(rest, recorded.tick), of=recorded.tick)
-    assert replay.compare(recorded.session, recorded.model) == expected
-
-    last = recorded.session.forces[-1]
-    last["force_n"] = [[force + 1e-15 for force in last["force_n"][0]]]
-    difference = replay.compare(recorded.session, recorded.model).difference
-    assert difference is not None
-    assert f"tick {last['tick']}: force_n" in difference
-
-
-def test_a_reset_breaks_it_off_until_the_next_rest(recorded: Recorded) -> None:
-    recorded.run(250, commanded=True)
-    recorded.reset()
-    recorded.run(250, commanded=True)
-    expected = repeated(recorded.session, range(350), of=600)
-    assert replay.compare(recorded.session, recorded.model) == expected
-    recorded.come_to_rest()
-    rest = recorded.at_rest_since
-    recorded.run(400 - recorded.tick % 100, commanded=True)
-    expected = repeated(recorded.session, range(350), range(rest, recorded.tick), of=recorded.tick)
-    assert replay.compare(recorded.session, recorded.model) == expected
-
-
-@pytest.mark.parametrize("lost", [0, 1])
-def test_where_a_missing_status_may_have_told_of_other_limits_nothing_is_repeated(
-    recorded: Recorded, lost: int
+def test_a_bit_that_is_another_is_found_and_named(
+    eventful: tuple[Path, list[ReducedModel]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    tighter = [OBSERVED._replace(max_force_n=largest) for largest in (0.02, 0.01)]
-    recorded.agree(OBSERVED)
-    recorded.run(450, commanded=True)
-    for limits in tighter:
-        recorded.agree(limits)
-        recorded.run(30, commanded=True)
-        recorded.say_status()
-    recorded.run(390, commanded=True)
-    statuses = recorded.session.statuses
-    if lost:
-        (first_of_them,) = [status for status in statuses if status["ticks"] == 580]
-        statuses.remove(first_of_them)
-        expected = repeated(recorded.session, range(300), of=1000)
-    else:
-        expected = repeated(recorded.session, range(1000))
-    assert replay.compare(recorded.session, recorded.model) == expected
+    path, models = eventful
+    recorded = replay.read_recording(path)
+    for name, index in (("force_n", (200, 1, 2)), ("position_m", (3, 0, 0)), ("energy_j", (150, 0))):
+        changed = dataclasses.replace(recorded, ports=recorded.ports.copy())
+        changed.ports[name][index] = np.nextafter(changed.ports[name][index], np.inf)
+        difference = replay.compare(changed, models).difference
+        assert difference is not None
+        assert difference.startswith(f"tick {300 + index[0]}: {name} was")
 
 
-def test_a_missing_status_with_nothing_new_breaks_nothing_off(recorded: Recorded) -> None:
-    recorded.run(900, commanded=True)
-    del recorded.session.statuses[3:6]
-    assert replay.compare(recorded.session, recorded.model) == repeated(recorded.session, range(1000))
+@pytest.mark.usefixtures("patiently")
+def test_missing_ticks_end_a_stretch_and_the_next_state_begins_another(loop: Loop, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    loop.record(path)
+    loop.run(200)
+    loop.change(scheduler.save)
+    loop.run(100)
+    recorded = finished(loop, path)
+    kept = np.delete(np.arange(300), 100)
+    gap = Recorded(recorded.settings, recorded.ticks[kept], recorded.ports[kept])
+    comparison = replay.compare(gap, [loop.model])
+    assert (comparison.ticks, comparison.of, comparison.stretches) == (200, 300, 2)
+    assert comparison.difference is None
+    # Nor is a change repeated that the recording does not tell: here the file ended before it was written.
+    untold = Recorded({0: recorded.settings[0]}, recorded.ticks, recorded.ports)
+    assert replay.compare(untold, [loop.model]).ticks == 200
 
 
-def test_a_reset_that_a_missing_status_told_of_may_not_have_been_the_only_one(recorded: Recorded) -> None:
-    recorded.run(600, commanded=True)
-    recorded.reset()
-    recorded.run(50, commanded=True)
-    recorded.say_status()
-    recorded.reset()
-    recorded.run(50, commanded=True)
-    recorded.come_to_rest()
-    rest = recorded.at_rest_since
-    recorded.run(400 - recorded.tick % 100, commanded=True)
-    told = [status["number"] for status in recorded.session.statuses if status["ticks"] == 750]
-    recorded.session.statuses = [s for s in recorded.session.statuses if s["number"] not in told]
-    expected = repeated(recorded.session, range(500), range(rest, recorded.tick), of=recorded.tick)
-    assert replay.compare(recorded.session, recorded.model) == expected
+@pytest.mark.usefixtures("patiently")
+def test_a_recording_longer_than_the_ring_repeats(loop: Loop, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    recording = loop.record(path)
+    for _ in range(3):
+        loop.run(RECORDS // 2)
+        recording._collect()  # in time, however busy the machine
+    recorded = finished(loop, path)
+    assert replay.compare(recorded, [loop.model]) == everything(recorded)
 
 
-def test_the_ticks_of_another_model_are_left_out(recorded: Recorded) -> None:
-    recorded.run(300, commanded=True)
-    recorded.come_to_rest()
-    recorded.undisturbed_since = changed = recorded.tick
-    recorded.told = recorded.told | {"order": recorded.model.order + 2}
-    recorded.run(1000, commanded=False)
-    recorded.say_status()
-    expected = repeated(recorded.session, range(changed), of=recorded.tick)
-    assert replay.compare(recorded.session, recorded.model) == expected
-
-
-def test_a_force_that_the_device_was_rendering_before_the_stretch_counts_in_its_energy(
-    recorded: Recorded,
+def test_models_that_the_recording_is_not_of_are_refused(
+    eventful: tuple[Path, list[ReducedModel]], make_spring_mass_model: Callable[..., ReducedModel]
 ) -> None:
-    recorded.run(300, commanded=True)
-    pressed = recorded.tick - 1
-    recorded.come_to_rest()
-    while (
-        recorded.tick - pressed > shared_memory.RECORDS - 300
-    ):  # so long ago that nobody could still be rendering it
-        recorded.run(100, commanded=True)
-        pressed = recorded.tick - 1
-        recorded.reset()
-        recorded.come_to_rest()
-    recorded.run(300, commanded=True, rendered_tick=pressed)
-    recorded.say_status()
-    session = recorded.only(pressed - 100)
-    result = replay.compare(session, recorded.model)
-    assert result.difference is None
-    assert result.stretches == 2
-    assert result.ticks > 400
+    with pytest.raises(replay.ReplayError, match="is of other models"):
+        replay.compare(replay.read_recording(eventful[0]), [make_spring_mass_model(2, 3)])
 
 
-def test_what_was_not_told_any_more_is_not_repeated(recorded: Recorded) -> None:
-    recorded.run(250, commanded=True)
-    assert replay.compare(recorded.session, recorded.model) == repeated(recorded.session, range(300))
-
-
-def test_a_missing_command_is_counted_only_while_it_was_in_use(recorded: Recorded) -> None:
-    recorded.agree(OBSERVED)
-    recorded.run(300, commanded=True, by_m=1e-4)
-    recorded.run(700)  # silence: its last command is known, and too old
-    message = recorded.session.forces[-1]
-    assert message["sequence"] == [300]
-    recorded.lose_command_of(message)
-    expected = repeated(recorded.session, range(1100), lost=1 + HOLD_NS // 1_000_000)
-    assert replay.compare(recorded.session, recorded.model) == expected
-
-
-def test_a_missing_command_that_met_a_limit_breaks_it_off(recorded: Recorded) -> None:
-    recorded.agree(OBSERVED)
-    recorded.run(300, commanded=True)
-    limited = int(Flags.SPEED_LIMITED)
-    victim = next(m for m in recorded.session.forces[200:] if m["flags"][0] & limited)
-    recorded.lose_command_of(victim)
-    expected = repeated(recorded.session, range(victim["tick"]), of=400)
-    assert replay.compare(recorded.session, recorded.model) == expected
-
-
-def give_out_energy(recorded: Recorded, ticks: int) -> None:
-    """In and out, slowly enough for every limit, as if the device felt nothing on its way in, and then the largest force."""
-    for i in range(ticks):
-        depth = min(i % 40, 40 - i % 40)
-        rendered_tick = 0 if i % 40 < 20 else recorded.tick - i % 40 + 20
-        recorded.run(1, commanded=True, rendered_tick=rendered_tick, to_m=(0.0, 0.0, -1e-4 * depth))
-
-
-def test_a_missing_command_breaks_it_off_where_the_force_goes_by_the_energy(recorded: Recorded) -> None:
-    give_out_energy(recorded, 200)
-    flags = [message["flags"][0] for message in recorded.session.forces]
-    assert not np.bitwise_or.reduce(flags[150:]) & int(Flags.SPEED_LIMITED | Flags.WORKSPACE_CLAMPED)
-    assert np.count_nonzero(np.array(flags[250:]) & int(Flags.PASSIVITY_LIMITED)) > 10
-    for victim in recorded.session.forces[200:250:10]:
-        kept = dict(recorded.session.commands)
-        recorded.lose_command_of(victim)
-        expected = repeated(recorded.session, range(victim["tick"]), of=300)
-        assert replay.compare(recorded.session, recorded.model) == expected
-        recorded.session.commands = kept
-
-
-def test_after_a_missing_command_the_energy_is_known_to_a_passivity_control_that_comes_later(
-    recorded: Recorded,
+@pytest.mark.parametrize(
+    "content", [b"nothing of the kind", b"PK\x03\x04" + bytes(1000), b"", b"\x89MCAP0\r\n"]
+)
+def test_what_is_no_recording_is_refused(
+    content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recorded.agree(OBSERVED)
-    give_out_energy(recorded, 200)
-    recorded.agree(
-        CEILING._replace(max_damping_n_s_per_m=1e4)
-    )  # so much that the energy decides how much of it
-    give_out_energy(recorded, 200)
-    flags = [message["flags"][0] for message in recorded.session.forces[300:]]
-    assert np.count_nonzero(np.array(flags) & int(Flags.PASSIVITY_LIMITED)) > 10
-    for victim in recorded.session.forces[200:300:10]:
-        recorded.lose_command_of(victim)
-    assert replay.compare(recorded.session, recorded.model) == repeated(recorded.session, range(500), lost=10)
+    (tmp_path / "no.mcap").write_bytes(content)
+    for name in ("no.mcap", "missing.mcap"):
+        assert replay.main([str(tmp_path / name), "model.npz"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert name in line
 
 
-def test_a_rendered_force_that_is_not_recorded_breaks_it_off_where_the_force_goes_by_the_energy(
-    recorded: Recorded,
+def test_a_recording_can_be_read_wherever_it_breaks_off(eventful: tuple[Path, list[ReducedModel]]) -> None:
+    path, models = eventful
+    data = path.read_bytes()
+    short = path.with_name("short.mcap")
+    counts = []
+    for size in np.linspace(len(data) // 4, len(data) - 1, 12).astype(int).tolist():
+        short.write_bytes(data[:size])
+        try:
+            recorded = replay.read_recording(short)
+        except replay.ReplayError as error:
+            assert "holds no ticks" in str(error)
+            continue
+        assert replay.compare(recorded, models).difference is None
+        counts.append(len(recorded.ticks))
+    assert counts == sorted(counts)
+    assert counts[-1] > 100
+
+
+def test_no_damage_is_taken_for_a_difference_and_each_gives_one_line(
+    eventful: tuple[Path, list[ReducedModel]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recorded.run(300, commanded=True)
-    pressed = recorded.tick - 1
-    recorded.reset()
-    recorded.come_to_rest()
-    rest = recorded.at_rest_since
-    assert recorded.tick - pressed < shared_memory.RECORDS - 300
-    recorded.run(300 - recorded.tick % 100, commanded=True)
-    told = recorded.tick
-    recorded.run(100, commanded=True, rendered_tick=pressed)
-    session = recorded.only(pressed + 1)
-    expected = repeated(session, range(rest, told), of=recorded.tick - pressed - 1)
-    assert replay.compare(session, recorded.model) == expected
-
-
-# Commands that could be mistaken for one another
-
-
-def duplicate(recorded: Recorded, client: str, tick: int) -> None:
-    """Have in the recording, right behind the command of a tick, one to elsewhere with its sequence and client time."""
-    message = recorded.session.forces[tick]
-    key = "surgeon", message["sequence"][0], message["client_time_ns"][0]
-    command, after_tick = recorded.session.commands[key][0]
-    elsewhere = replay.Heard(command._replace(displacement_m={"tip": (0.0, 0.0, 3e-3)}), after_tick)
-    recorded.session.commands.setdefault((client, *key[1:]), []).append(elsewhere)
-
-
-def test_a_refused_command_is_not_taken_for_the_one_that_a_tick_used(recorded: Recorded) -> None:
-    recorded.run(400, commanded=True)
-    duplicate(recorded, "somebody", 150)  # who holds nothing
-    duplicate(recorded, "surgeon", 350)  # the same number again
-    assert replay.compare(recorded.session, recorded.model) == repeated(recorded.session, range(500))
-
-
-def test_what_somebody_else_sends_does_not_stand_in_for_a_missing_command(recorded: Recorded) -> None:
-    recorded.run(400, commanded=True)
-    duplicate(recorded, "somebody", 350)
-    recorded.lose_command_of(recorded.session.forces[350])
-    expected = repeated(recorded.session, range(350), of=500)
-    assert replay.compare(recorded.session, recorded.model) == expected
-
-
-def test_a_command_that_may_have_been_refused_before_the_hold_counts_as_missing(recorded: Recorded) -> None:
-    recorded.agree(frame=IDENTITY)  # the hold begins here
-    recorded.run(400, commanded=True)
-    duplicate(recorded, "surgeon", 150)
-    expected = repeated(recorded.session, range(150), of=500)
-    assert replay.compare(recorded.session, recorded.model) == expected
-
-
-def test_a_command_that_may_have_been_refused_for_another_contact_counts_as_missing(
-    recorded: Recorded,
-) -> None:
-    recorded.run(400, commanded=True)
-    heard = recorded.session.commands["surgeon", 251, 351_000_000]
-    command, after_tick = heard[0]
-    more = {"tip": (0.0, 0.0, 3e-3), "somebody's": wire.STILL}
-    heard.insert(0, replay.Heard(command._replace(displacement_m=more), after_tick))
-    expected = repeated(recorded.session, range(350), of=500)
-    assert replay.compare(recorded.session, recorded.model) == expected
-
-
-def test_a_client_that_begins_to_count_anew_in_its_next_hold_is_understood(recorded: Recorded) -> None:
-    recorded.constant_time = True
-    recorded.run(400, commanded=True)
-    recorded.come_to_rest()
-    recorded.agree(frame=SHIFTED)
-    recorded.sequence = 0
-    recorded.run(400 + 100 - recorded.tick % 100, commanded=True)
-    heard = recorded.session.commands["surgeon", 400, 0]
-    assert len(heard) == 2
-    result = replay.compare(recorded.session, recorded.model)
-    assert result == repeated(recorded.session, range(recorded.tick))
-
-
-def test_whose_command_a_tick_used_is_not_known_when_no_status_tells(recorded: Recorded) -> None:
-    recorded.agree(OBSERVED)
-    recorded.terms["holder"] = None
-    recorded.run(300, commanded=True, by_m=1e-4)
-    for status in recorded.session.statuses:
-        status["contacts"]["tip"]["holder"] = None
-    assert replay.compare(recorded.session, recorded.model) == repeated(
-        recorded.session, range(400), lost=300
-    )
-
-
-# What the command line says of it
-
-
-def exit_code(recorded: Recorded, path: Path) -> int:
-    """Of a replay of the session, written to a file and read again."""
-    with (path / "a.mcap").open("wb") as stream:
-        recorded.write(Recording(stream))
-    save_model(recorded.model, path / "model.npz")
-    return replay.main([str(path / "a.mcap"), str(path / "model.npz")])
-
-
-def test_exit_code_0_is_for_a_recording_of_which_every_tick_was_repeated(
-    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recorded.run(300, commanded=True)
-    with_force = sum(any(message["force_n"][0]) for message in recorded.session.forces)
-    assert exit_code(recorded, tmp_path) == 0
-    said = f"400 of 400 ticks repeated, {with_force} with a force: every force is the same, bit for bit\n"
-    assert capsys.readouterr().out == said
-
-
-def test_a_command_that_was_refused_for_its_numbers_is_as_good_as_not_recorded(
-    recorded: Recorded, tmp_path: Path
-) -> None:
-    recorded.run(400, commanded=True)
-    heard = recorded.session.commands["surgeon", 251, 351_000_000]
-    command, after_tick = heard[0]
-    for number in (2000.0, float("nan")):
-        refused = command._replace(displacement_m={"tip": (number, 0.0, 0.0)})
-        heard.insert(0, replay.Heard(refused, after_tick))
-    assert exit_code(recorded, tmp_path) == 0
-
-
-def test_exit_code_3_is_for_a_recording_of_which_a_part_could_not_be_compared(
-    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recorded.run(300, commanded=True, by_m=0.1)
-    recorded.lose_command_of(recorded.session.forces[100])
-    assert exit_code(recorded, tmp_path) == 3
-    said = "100 of 400 ticks repeated, 0 with a force: these forces are the same, bit for bit; the others could not be"
-    assert said in capsys.readouterr().out
-
-
-def test_exit_code_1_is_for_a_recording_with_a_force_that_is_another(
-    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recorded.run(300, commanded=True)
-    recorded.session.forces[350]["force_n"][0][0] += 1e-12
-    assert exit_code(recorded, tmp_path) == 1
-    assert "tick 350: force_n was" in capsys.readouterr().out
-
-
-def test_exit_code_2_is_for_a_recording_that_can_not_be_repeated_at_all(
-    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recorded.run(300, commanded=True)
-    recorded.session = recorded.only(100)
-    assert exit_code(recorded, tmp_path) == 2
-    assert "never at rest" in capsys.readouterr().err
+    """A fuzzer: bits flipped, pieces cut out, doubled or zeroed, anywhere."""
+    path, models = eventful
+    files = [tmp_path / "one.npz", tmp_path / "other.npz"]
+    for model, file in zip(models, files, strict=True):
+        save_model(model, file)
+    data = path.read_bytes()
+    random = np.random.default_rng(7)
+    damaged = tmp_path / "damaged.mcap"
+    refused = 0
+    for attempt in range(120):
+        place, length = int(random.integers(len(data))), int(random.integers(1, 400))
+        broken = bytearray(data)
+        match attempt % 4:
+            case 0:
+                broken[place] ^= 1 << int(random.integers(8))
+            case 1:
+                del broken[place : place + length]
+            case 2:
+                broken[place:place] = broken[place : place + length]
+            case 3:
+                broken[place : place + length] = bytes(len(broken[place : place + length]))
+        if broken == data:
+            continue
+        damaged.write_bytes(broken)
+        code = replay.main([str(damaged), *map(str, files)])
+        out, err = capsys.readouterr()
+        if code == 2:
+            refused += 1
+            assert len(err.splitlines()) == 1
+            assert err.startswith("palpate replay: ")
+        else:  # what was damaged is nothing that a replay reads
+            assert code == 0, (attempt, place, out, err)
+    assert refused > 80
 
 
 def test_help_tells_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         replay.main(["--help"])
-    told = capsys.readouterr().out
-    for code in ("0:", "1:", "2:", "3:"):
-        assert code in told
-
-
-def test_another_model_is_refused(
-    recorded: Recorded, make_spring_mass_model: Callable[..., ReducedModel]
-) -> None:
-    recorded.run(100)
-    with pytest.raises(replay.ReplayError, match="another configuration"):
-        replay.compare(recorded.session, make_spring_mass_model(1, 6))
-    with pytest.raises(replay.ReplayError, match="another configuration"):
-        replay.compare(recorded.session, make_spring_mass_model(2))
-
-
-def test_a_recording_can_be_read_wherever_it_breaks_off(tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    recording = Recording(stream)
-    recording.add("describe", "palpate/test/describe", 0, wire.pack({"session": "test"}))
-    encoder = wire.ForceEncoder(1)
-    for tick in range(600):
-        inputs, motion = np.full((1, 4), tick, np.int64), np.random.default_rng(tick).normal(size=(1, 8))
-        recording.add("force", "palpate/test/force", tick, encoder.encode(tick, tick, inputs, motion))
-    whole = stream.getvalue()  # all but what is still in the writer's hands: at least two chunks
-    path = tmp_path / "cut.mcap"
-    lengths = []
-    half = len(whole) // 2
-    for cut in (len(whole), *range(len(whole) - 40, len(whole)), *range(half, half + 40)):
-        path.write_bytes(whole[:cut])
-        lengths.append(len(replay.read_session(path).forces))
-    assert lengths[0] > lengths[-1]
-    assert min(lengths) > 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Exit code 0:" in text
+    assert "2: the file is damaged" in text

@@ -48,7 +48,7 @@ def commander(session: Any) -> Commander:
 
 @pytest.fixture
 def requests(session: Any, tmp_path: Path) -> Requests:
-    return Requests(session.state, lambda client: True, lambda: None, tmp_path, None)
+    return Requests(session.state, lambda client: True, lambda: None, tmp_path, None, 0)
 
 
 def depth_of_tip(state: Any, pressed: list[float]) -> list[float]:
@@ -62,7 +62,7 @@ def test_a_command_moves_the_tip_to_its_position(
     requests.carry_out("first", "acquire", {"tools": ["tip"]})
     goal = depth_of_tip(session.state, [0.0, 0.0, -1e-3])
     give_up = time.monotonic() + 60
-    while not np.array_equal(session.state.memory.applied[0], goal):
+    while not np.array_equal(session.state.memory.ports["applied_m"][0], goal):
         assert time.monotonic() < give_up
         commander.send("first", tip=goal)
         time.sleep(0.001)
@@ -126,14 +126,14 @@ def test_a_command_that_was_checked_before_its_tool_changed_hands_is_not_carried
             return holder
 
     state.leases.holders = ChangingHands(state.leases.holders)
-    at_home = state.memory.applied.copy()
-    first_tick = state.memory.counters[0]
+    at_home = state.memory.ports["applied_m"].copy()
+    first_tick = state.memory.counters["ticks"][0]
     commander.send("first", tip=depth_of_tip(state, [0.0, 0.0, 0.02]))
     assert state.leases.holders["tip"] == "second"
     give_up = time.monotonic() + 60
-    while state.memory.counters[0] < first_tick + 20:  # ticks that could have used it
+    while state.memory.counters["ticks"][0] < first_tick + 20:  # ticks that could have used it
         assert time.monotonic() < give_up
         time.sleep(0.001)
-    np.testing.assert_array_equal(state.memory.applied, at_home)
+    np.testing.assert_array_equal(state.memory.ports["applied_m"], at_home)
     commander.send("second", tip=depth_of_tip(state, [0.0, 0.0, 1e-3]))
     assert state.messages.accepted == 2  # the first one was, before its hold ended

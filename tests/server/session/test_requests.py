@@ -23,7 +23,7 @@ from palpate_server.session.requests import Requests
 def requests(session: Any, tmp_path: Path) -> Requests:
     """Every client is alive, and the folder of models has the running one as same.npz."""
     save_model(session.state.model, tmp_path / "same.npz")
-    return Requests(session.state, lambda client: True, lambda: None, tmp_path, None)
+    return Requests(session.state, lambda client: True, lambda: None, tmp_path, None, 0)
 
 
 def wait_for(condition: Callable[[], object], what: str, seconds: float = 60.0) -> None:
@@ -66,7 +66,7 @@ def test_acquiring_gives_all_tools_or_leaves_all_as_they_were(session: Any, requ
     state.leases.holders["tip1"] = "first"
     before = dict(state.leases.holders), dict(state.leases.settings)
     session.stop()
-    state.memory.scale[1] = 0.5  # of a force that no tick lets fade
+    state.memory.ports["force_scale"][1] = 0.5  # of a force that no tick lets fade
     request = {"tools": ["tip", "tip1"], "frame": {"scale": 2.0}}
     assert refusal_of(requests, "first", "acquire", request) == "busy"
     assert (state.leases.holders, state.leases.settings) == before
@@ -82,10 +82,11 @@ def test_without_a_tick_a_change_is_refused_and_not_made_later_either(
     for action, request in (("limits", {"limits": {"max_force_n": 1.0}}), ("reset", {})):
         assert refusal_of(requests, "first", action, request) == "busy"
     assert state.leases.settings["tip"].limits.max_force_n == 10.0
-    state.memory.scale[:] = 0.5
-    scheduler.repeat_tick(state.image, time.monotonic_ns())
-    assert state.memory.limits[0, 0] == 10.0
-    assert np.all(state.memory.scale > 0)  # a reset would have made it zero
+    state.memory.ports["force_scale"] = 0.5
+    now = time.monotonic_ns()
+    scheduler.repeat_tick(state.image, now, now, False)
+    assert state.memory.settings["max_force_n"][0] == 10.0
+    assert np.all(state.memory.ports["force_scale"] > 0)  # a reset would have made it zero
 
 
 def test_while_the_server_stops_changes_are_refused_at_once(session: Any, requests: Requests) -> None:

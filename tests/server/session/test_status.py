@@ -45,9 +45,9 @@ def test_success_rate_is_the_share_of_recent_ticks_with_a_new_command(
     memory = shared_memory.make_memory(model.discrete, model.period_s, [limits], 1 / 30)
     assert status.recent_success_rate(memory, 0) == 0
     memory.shared[shared_memory.HEAD] = 500
-    memory.record_inputs[:500, 0, shared_memory.CONTACT_FLAGS] = int(Flags.STALE)
-    memory.record_inputs[400:480, 0, shared_memory.CONTACT_FLAGS] = int(Flags.SOFT_START)
-    memory.record_inputs[480:490, 0, shared_memory.CONTACT_FLAGS] = int(Flags.HELD)
+    memory.ring.ports["flags"][:500] = int(Flags.STALE)
+    memory.ring.ports["flags"][400:480] = int(Flags.SOFT_START)
+    memory.ring.ports["flags"][480:490] = int(Flags.HELD)
     assert status.recent_success_rate(memory, 0) == 0.8
 
 
