@@ -1,4 +1,4 @@
-"""What is compiled once is found again, and found out of date when any file of the package has changed."""
+"""What is compiled once is found again, and found out of date when any file with compiled functions has changed."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import pytest
 
 from palpate_server.realtime import compiled
 
-CALLEE = "from gauge.compiled import compiled\n\n@compiled\ndef callee(x):\n    return {} * x\n"
-CALLER = "from gauge import callee\nfrom gauge.compiled import compiled\n\n@compiled\ndef caller(x):\n    return callee.callee(x) + 1.0\n"
+CALLEE = "from gauge.realtime.compiled import compiled\n\n@compiled\ndef callee(x):\n    return {} * x\n"
+CALLER = "from gauge.realtime import callee\nfrom gauge.realtime.compiled import compiled\n\n@compiled\ndef caller(x):\n    return callee.callee(x) + 1.0\n"
 CALL = """
 import json
 import warnings
 with warnings.catch_warnings(record=True) as seen:
     warnings.simplefilter("always")
-    from gauge.caller import caller
+    from gauge.realtime.caller import caller
 result = caller(1.0)
 hits = sum(caller.stats.cache_hits.values())
 print(json.dumps({"result": result, "hits": hits, "path": caller.stats.cache_path, "warnings": [str(w.message) for w in seen]}))
@@ -30,11 +30,12 @@ print(json.dumps({"result": result, "hits": hits, "path": caller.stats.cache_pat
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
-    """A package of two modules that uses the very file under test."""
-    folder = tmp_path / "source" / "gauge"
+    """The room `realtime` of a package `gauge`, with two modules that use the very file under test."""
+    folder = tmp_path / "source" / "gauge" / "realtime"
     folder.mkdir(parents=True)
     shutil.copy(compiled.__file__, folder / "compiled.py")
-    (folder / "__init__.py").touch()
+    for path in (folder / "__init__.py", folder.parent / "__init__.py", folder.parent / "wire.py"):
+        path.touch()
     (folder / "callee.py").write_text(CALLEE.format("2.0"))
     (folder / "caller.py").write_text(CALLER)
     return folder
@@ -44,7 +45,7 @@ def call(package: Path, **environment: str) -> dict[str, Any]:
     inherited = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
     run = subprocess.run(
         [sys.executable, "-c", CALL],
-        env=inherited | {"PYTHONPATH": str(package.parent), "PYTHONDONTWRITEBYTECODE": "1"} | environment,
+        env=inherited | {"PYTHONPATH": str(package.parents[1]), "PYTHONDONTWRITEBYTECODE": "1"} | environment,
         capture_output=True,
         text=True,
         timeout=120,
@@ -71,8 +72,11 @@ def test_an_edit_of_any_file_makes_all_compiled_code_out_of_date_and_nothing_els
     assert (edited["result"], edited["hits"]) == (6.0, 0)
     for index in folder.rglob("*.nbi"):
         index.write_bytes(index.read_bytes()[:-20])  # of the version before: must not even be read
-    (package / "another.py").write_text("NUMBER = 1\n")
-    assert call(package, NUMBA_CACHE_DIR=str(folder))["hits"] == 0
+    for another in (package / "another.py", package.parent / "wire.py"):
+        another.write_text("NUMBER = 1\n")
+        assert call(package, NUMBA_CACHE_DIR=str(folder))["hits"] == 0
+    (package.parent / "session.py").write_text("NUMBER = 1\n")
+    assert call(package, NUMBA_CACHE_DIR=str(folder))["hits"] == 1
 
 
 def test_without_another_place_compiled_code_is_kept_beside_the_source(package: Path) -> None:

@@ -121,10 +121,10 @@ def test_a_passive_spring_is_left_alone_and_its_energy_is_counted_exactly() -> N
     energy, position, rendered = 0.0, 0.0, np.zeros(3)
     for depth in np.linspace(0, 0.01, 200)[1:]:
         step = np.array([0.0, 0.0, depth - position])
-        force = np.array([0.0, 0.0, stiffness * depth])
+        force = np.array([0.0, 0.0, -stiffness * depth])  # on the device
         energy, flags = safety.keep_passive(energy, rendered, step, force, 1.0, period)
         assert flags == 0
-        np.testing.assert_array_equal(force, [0.0, 0.0, stiffness * depth])
+        np.testing.assert_array_equal(force, [0.0, 0.0, -stiffness * depth])
         rendered, position = force, depth
     # A held force lags by a step: the sum is the integral of the spring less half a step of the final force.
     step_m = 0.01 / 199
@@ -144,11 +144,11 @@ def test_energy_that_came_out_is_taken_back_by_a_bounded_damping() -> None:
 
     force = np.zeros(3)
     safety.keep_passive(-1.0, np.zeros(3), step, force, max_damping, period)
-    np.testing.assert_allclose(force, max_damping * step / period)
+    np.testing.assert_allclose(force, -max_damping * step / period)
 
 
 def test_without_allowed_damping_passivity_is_only_observed() -> None:
     force = np.ones(3)
     energy, flags = safety.keep_passive(-1.0, np.ones(3), np.ones(3), force, 0.0, 1e-3)
-    assert (energy, flags) == (2.0, 0)
+    assert (energy, flags) == (-4.0, 0)
     np.testing.assert_array_equal(force, 1.0)
