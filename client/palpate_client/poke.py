@@ -20,7 +20,6 @@ from typing import Any
 
 import zenoh
 
-from palpate.files import check_output, write_atomically
 from palpate_client.arguments import add_connection_options, connection_for, positive
 from palpate_client.connection import Connection, steps
 from palpate_client.errors import ClientError, ServerGone, ToolLost
@@ -45,6 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(connection: Connection, options: argparse.Namespace) -> int:
     if options.record:
+        from palpate.files import check_output
+
         check_output(Path(options.record))  # better to fail now than after the poke
     tool = Tool(connection, options.tool, silence_s=options.silence_s)
     messages: list[dict[str, Any]] = []
@@ -143,6 +144,8 @@ def wrote(path: str, description: Description, messages: list[dict[str, Any]]) -
         header += [f"{name}.sequence", f"{name}.flags", f"{name}.force_scale"]
         header += [f"{name}.position_{axis}_m" for axis in "xyz"]
         header += [f"{name}.force_{axis}_n" for axis in "xyz"]
+    from palpate.files import write_atomically
+
     try:
         table = io.StringIO(newline="")
         writer = csv.writer(table)

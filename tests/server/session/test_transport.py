@@ -112,7 +112,7 @@ def _priorities(*prefix: str) -> dict[str, list[int]]:
         [*prefix, sys.executable, "-c", PRIORITIES], capture_output=True, text=True, timeout=60, check=True
     )
     found: dict[str, list[int]] = json.loads(program.stdout)
-    assert len(found["zenoh"]) == 3
+    assert found["zenoh"]  # Zenoh starts some of its threads only when they are needed
     assert len(found["callback"]) == 1
     return found
 
