@@ -80,20 +80,22 @@ def aligned(values: Floats) -> Floats:
 @compiled
 def output(body: StateSpaceBody, displacement: Floats) -> None:
     """Write F = C xi + D u into the body's force; displacement (n_inputs,), m."""
-    for row in range(body.c.shape[0]):
-        body.force[row] = dot(body.c[row], body.state) + dot(body.d[row], displacement)
+    c, d, state, force = body.c, body.d, body.state, body.force
+    for row in range(c.shape[0]):
+        force[row] = dot(c[row], state) + dot(d[row], displacement)
 
 
 @compiled
 def update(body: StateSpaceBody, displacement: Floats) -> None:
     """Advance the body's state in place: xi+ = A xi + B u; displacement (n_inputs,), m."""
-    diagonal, cross, state = body.diagonal, body.cross, body.state
+    # Taken out of the tuple once: in the loops the compiler could not know that what it writes is not the tuple itself.
+    diagonal, cross, b_transposed, state = body.diagonal, body.cross, body.b_transposed, body.state
     for pair in range(state.shape[0] // 2):
         i = 2 * pair  # with range(0, order, 2) the compiler would test every index for its sign
         first, second = state[i], state[i + 1]
         state[i] = diagonal[i] * first + cross[i] * second
         state[i + 1] = cross[i + 1] * first + diagonal[i + 1] * second
-    for j in range(body.b_transposed.shape[0]):
+    for j in range(b_transposed.shape[0]):
         u = displacement[j]
         for i in range(state.shape[0]):
-            state[i] += body.b_transposed[j, i] * u
+            state[i] += b_transposed[j, i] * u
