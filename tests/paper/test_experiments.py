@@ -38,7 +38,7 @@ def study() -> Study:
 
 def reproduce(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "palpate.cli", "reproduce", *arguments],
+        [sys.executable, "-m", "palpate", "reproduce", *arguments],
         cwd=folder,
         capture_output=True,
         text=True,
