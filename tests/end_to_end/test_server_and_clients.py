@@ -58,7 +58,8 @@ def test_forces_through_the_wire_are_the_tissues_answer_to_the_applied_positions
 ) -> None:
     """Forces are best effort. So what each tick applied is told by the server's recording, in which none is missing."""
     served = serve(
-        *("--max-force-n", "1000", "--max-force-rate-n-per-s", "1e9", "--recordings", str(tmp_path))
+        *("--max-force-n", "1000", "--max-force-rate-n-per-s", "1e9", "--max-speed-m-per-s", "100"),
+        *("--recordings", str(tmp_path)),
     )
     heard = tmp_path / "ticks.csv"
     with connect(served.endpoint) as client:
