@@ -26,14 +26,13 @@ ALLOWED = {
 """What a package may import of the others: these modules and what is inside them."""
 
 PROGRAMS = {
-    "palpate_server.session.transport": ("palpate_client.connection", "palpate_client.errors"),
     "palpate_server.recording.record": ("palpate_client",),
     "palpate_server.diagnostics": ("palpate_client",),
     "palpate.demo": ("palpate_client",),
     "palpate.cli": ("palpate_client",),
     "palpate.commands": ("palpate_client",),
 }
-"""What some may import beside that: Zenoh sessions are opened in one place, and these programs are clients themselves."""
+"""What some may import beside that: these programs are clients themselves."""
 
 LAZY = {("palpate.cli", "palpate_paper.reproduce"), ("palpate.commands", "palpate_paper.reproduce")}
 """Imported inside a function only, so that the product runs without it."""

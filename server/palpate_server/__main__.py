@@ -18,7 +18,7 @@ import zenoh
 
 from palpate.files import printable
 from palpate.model_file import ModelFileError, ReducedModel, load_model
-from palpate_client.wire import Keys
+from palpate_client.wire import DEFAULT_ENDPOINT, Keys
 from palpate_server.arguments import index, need, positive
 from palpate_server.realtime.safety import Limits, least_force_rate
 from palpate_server.session import log_limit, transport
@@ -131,7 +131,7 @@ def _parser() -> argparse.ArgumentParser:
     place.add_argument(
         "--listen",
         metavar="ENDPOINT",
-        default=transport.DEFAULT_ENDPOINT,
+        default=DEFAULT_ENDPOINT,
         help="Zenoh endpoint to listen on (default: %(default)s, this machine only)",
     )
     place.add_argument(

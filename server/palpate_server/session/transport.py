@@ -1,4 +1,4 @@
-"""Opens Zenoh sessions for the server and its tools: loopback and no scouting, unless a configuration file says otherwise."""
+"""Opens the server's Zenoh session: loopback and no scouting, unless a configuration file says otherwise."""
 
 from __future__ import annotations
 
@@ -11,10 +11,7 @@ from typing import Any
 
 import zenoh
 
-from palpate_client import connection
-from palpate_client.errors import ClientError
-from palpate_client.wire import DEFAULT_ENDPOINT as DEFAULT_ENDPOINT
-from palpate_client.wire import KEEP_ALIVES, LEASE_MS, MAX_MESSAGE_BYTES
+from palpate_client.wire import DEFAULT_ENDPOINT, KEEP_ALIVES, LEASE_MS, MAX_MESSAGE_BYTES
 from palpate_server.realtime import threads
 
 SETTINGS: Mapping[str, Any] = {
@@ -69,14 +66,6 @@ def _open(endpoint: str, config_file: Path | None) -> zenoh.Session:
     except zenoh.ZError as error:
         origin = f"zenoh configuration {config_file}" if config_file else f"endpoint {endpoint}"
         raise TransportError(f"{origin}: {_first_cause(error)}") from error
-
-
-def connect_session(endpoint: str, config_file: Path | None) -> zenoh.Session:
-    """A client's session, as palpate_client opens it. Raises TransportError."""
-    try:
-        return connection.open_session(endpoint, config_file)
-    except ClientError as error:
-        raise TransportError(str(error)) from error
 
 
 def _first_cause(error: zenoh.ZError) -> str:
