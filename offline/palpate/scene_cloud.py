@@ -101,7 +101,7 @@ def _refinements(config: Config) -> tuple[Refinement, ...]:
     if not isinstance(config.geometry, SurfaceGeometry):
         return ()
     return tuple(
-        Refinement(t.point_m, t.radius_m, t.spacing_m, growth=config.geometry.growth, rings=True)
+        Refinement(t.point_m, t.radius_m, t.spacing_m, config.geometry.growth)
         for t in config.contact
         if t.spacing_m is not None
     )

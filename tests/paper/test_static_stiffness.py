@@ -50,7 +50,7 @@ REFERENCE = HALF_SPACE * (1 + 1.71 / HALF_WIDTH)
 def _punch_stiffness(spacing, growth):
     """Normal stiffness of a tip of radius 1 bonded to the top of a block that is held at all other faces; G = 1."""
     r = HALF_WIDTH
-    refinement = Refinement((0.0, 0.0, 0.0), 1.0, spacing, growth=growth, rings=True)
+    refinement = Refinement((0.0, 0.0, 0.0), 1.0, spacing, growth=growth)
     cloud = fill_surface(box_lattice((-r, -r, -r), (r, r, 0), (2, 2, 2)).surface, r / 4, (refinement,))
     x = np.abs(cloud.points)
     held = np.flatnonzero((x[:, 0] > r - 1e-6) | (x[:, 1] > r - 1e-6) | (x[:, 2] > r - 1e-6))

@@ -7,9 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-INTERIOR = 0
-"""Tag of a node that is not on the boundary."""
-
 
 @dataclass(frozen=True)
 class TriangleSurface:
@@ -31,8 +28,7 @@ class NodeCloud:
     normals  (n_nodes, 3), unit outward normals; zero at interior nodes
     volumes  (n_nodes,), m³; they sum to the body's volume
     areas    (n_nodes,), m²; zero at interior nodes, they sum to the body's surface
-    tags     (n_nodes,), 0 inside, k >= 1 on piece k of the boundary (a box: 1..6 for
-             x-, x+, y-, y+, z-, z+; bodies with one smooth boundary: 1)
+    boundary (n_nodes,), true on the boundary
     spacing  (n_nodes,), m; local distance between neighboring nodes, from which the support radius follows
     surface  the body's boundary, for a view
     """
@@ -41,15 +37,10 @@ class NodeCloud:
     normals: NDArray[np.float64]
     volumes: NDArray[np.float64]
     areas: NDArray[np.float64]
-    tags: NDArray[np.int32]
+    boundary: NDArray[np.bool_]
     spacing: NDArray[np.float64]
     surface: TriangleSurface
 
     @property
     def n_nodes(self) -> int:
         return len(self.points)
-
-    @property
-    def boundary(self) -> NDArray[np.bool_]:
-        """(n_nodes,), true on the boundary."""
-        return self.tags != INTERIOR

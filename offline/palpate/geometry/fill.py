@@ -10,17 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from palpate.geometry.cloud import INTERIOR, NodeCloud, TriangleSurface
+from palpate.geometry.cloud import NodeCloud, TriangleSurface
 from palpate.geometry.measures import enclosed_volume, triangle_normals
 from palpate.geometry.sampling import Samples, closest_point, depth_inside, sample_elements, sample_inside
 from palpate.geometry.sharp_edges import sharp_edges
 from palpate.geometry.spacing import Refinement, SpacingField
 from palpate.geometry.tributary import nearest_node, tributary_measures
+from palpate.scene.quantities import MAX_NODES
 
 Array = NDArray[np.float64]
-
-MAX_NODES = 200_000
-"""More than this is taken for a slip of units."""
 
 _PLACING, _MEASURING = 1 / 4, 1 / 8
 """Distance of samples over that of nodes, where nodes are placed and where their shares are measured."""
@@ -37,7 +35,7 @@ def fill_surface(
     """Fill the inside of a surface that `check_surface` accepts; the boundary nodes lie on it and come first.
 
     spacing_m    distance between nodes away from the refinements, m
-    refinements  balls with nodes closer together
+    refinements  round patches with nodes closer together
     seed         of the random order in which nodes are placed; the same seed gives the same cloud
 
     Nodes are placed on round patches, corners, sharp edges, faces and inside, in this order. Each time they are
@@ -46,11 +44,11 @@ def fill_surface(
     iteration for a centroidal Voronoi tessellation with density h^-(dimension + 2), Du et al. 1999).
 
     Volumes and areas are what is nearest to the node, in samples 1/8 spacing apart, and sum to the body's; normals
-    are the mean over that area. All boundary nodes have tag 1.
+    are the mean over that area.
 
     Raises ValueError when the spacing doesn't suit the body or a round patch finds no place on it.
     """
-    refinements = tuple(_fitted(r, surface) if r.rings else r for r in refinements)
+    refinements = tuple(_fitted(r, surface) for r in refinements)
     _check_spacing(surface, spacing_m, refinements)
     rng = np.random.default_rng(seed)
     field = SpacingField(spacing_m, refinements)
@@ -73,15 +71,13 @@ def fill_surface(
         normals=normals,
         volumes=tributary_measures(points, samples.points, samples.measures, enclosed_volume(surface)),
         areas=areas,
-        tags=np.where(np.arange(len(points)) < n_boundary, 1, INTERIOR).astype(np.int32),
+        boundary=np.arange(len(points)) < n_boundary,
         spacing=field(points),
         surface=surface,
     )
 
 
 def _check_spacing(surface: TriangleSurface, spacing_m: float, refinements: tuple[Refinement, ...]) -> None:
-    if not (np.isfinite(spacing_m) and spacing_m > 0):
-        raise ValueError(f"spacing_m = {spacing_m}: expected a length above 0")
     extent = np.ptp(surface.vertices, axis=0)
     if spacing_m > extent.max() / 4:
         raise ValueError(
@@ -94,7 +90,7 @@ def _check_spacing(surface: TriangleSurface, spacing_m: float, refinements: tupl
     if estimate > MAX_NODES:
         raise ValueError(
             f"spacing_m = {spacing_m} would give some {estimate:.2g} nodes in a body of "
-            f"{' x '.join(f'{e:.3g}' for e in extent)} m, expected at most {MAX_NODES}"
+            f"{' x '.join(f'{e:.3g}' for e in extent)} m, expected at most {MAX_NODES:,}"
         )
 
 
@@ -167,16 +163,15 @@ def _n_rings(patch: Refinement) -> int:
 
 
 def _patches(surface: TriangleSurface, field: SpacingField) -> Array:
-    """(n, 3), nodes of the refinements with rings, m."""
-    refined = [r for r in field.refinements if r.rings]
-    patches = [_rings(surface, r) for r in refined]
-    if not patches:
+    """(n, 3), nodes of the round patches, m."""
+    if not field.refinements:
         return np.empty((0, 3))
-    for patch, nodes in zip(refined, patches, strict=True):
+    patches = [_rings(surface, r) for r in field.refinements]
+    for patch, nodes in zip(field.refinements, patches, strict=True):
         _refuse_folded(patch, nodes)
     nodes = np.vstack(patches)
     owner = np.repeat(np.arange(len(patches)), [len(p) for p in patches])
-    nearest = 0.5 * min(r.spacing_m for r in refined)
+    nearest = 0.5 * min(r.spacing_m for r in field.refinements)
     for a, b in sorted(cKDTree(nodes).query_pairs(nearest)):
         if owner[a] != owner[b]:
             raise ValueError(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from palpate.geometry.cloud import INTERIOR, NodeCloud, TriangleSurface
+from palpate.geometry.cloud import NodeCloud, TriangleSurface
 from palpate.geometry.tributary import tributary_measures
 
 Array = NDArray[np.float64]
@@ -29,69 +31,49 @@ def box_lattice(
 
     Volumes and areas are the trapezoid rule's; with jitter, the parts of the box and of each face that are
     nearest to the node, measured with 8 samples a spacing. Either way they sum to the box's volume and surface.
-    An edge or corner node has the mean of its faces' normals, weighted with the area it holds of each, and the
-    tag of its first face in the order x-, x+, y-, y+, z-, z+. `spacing` is the largest of the three axes'.
-
-    Raises ValueError when an argument is out of its range.
+    An edge or corner node has the mean of its faces' normals, weighted with the area it holds of each.
+    `spacing` is the largest of the three axes'.
     """
     low, high, n = np.asarray(lower, float), np.asarray(upper, float), np.asarray(counts)
-    _check_box(low, high)
-    if n.shape != (3,) or np.any(n < 2):
-        raise ValueError(f"counts = {counts}: expected three numbers, each at least 2")
-    if not 0 <= jitter < 0.5:
-        raise ValueError(f"jitter = {jitter}: expected 0 <= jitter < 0.5 spacings")
-
     step = (high - low) / (n - 1)
     index = _lattice_index(n)
     points = np.where(index == n - 1, high, low + index * step)
-    on_lower, on_upper = index == 0, index == n - 1
-    faces = np.stack([on_lower, on_upper], axis=2).reshape(-1, 6)  # (n_nodes, 6), x-, x+, y-, ...
+    ends = np.stack([index == 0, index == n - 1], axis=2)  # (n_nodes, 3 axes, 2)
+    outer = ends.any(axis=2)
+    lengths = np.where(outer, 0.5, 1.0) * step  # what each node stands for along each axis, without jitter
+    samples = _SAMPLES_A_SPACING * (n - 1)
     if jitter:
         shift = np.random.default_rng(seed).uniform(-jitter, jitter, points.shape) * step
-        points = points + np.where(on_lower | on_upper, 0.0, shift)
-        volumes = tributary_measures(points, *_midpoints(low, high, _SAMPLES_A_SPACING * (n - 1)))
+        points = points + np.where(outer, 0.0, shift)
+        volumes = tributary_measures(points, *_midpoints(low, high, samples))
     else:
-        volumes = np.prod(np.where(on_lower | on_upper, 0.5, 1.0) * step, axis=1)
-    weights = None if jitter else np.where(on_lower | on_upper, 0.5, 1.0) * step
-    face_areas = _face_areas(points, faces, weights, (low, high), _SAMPLES_A_SPACING * (n - 1))
-    outward = np.repeat(np.eye(3), 2, axis=0) * np.tile([-1.0, 1.0], 3)[:, None]  # (6, 3)
-    normals = face_areas @ outward
-    boundary = faces.any(axis=1)
+        volumes = np.prod(lengths, axis=1)
+
+    normals, areas = np.zeros_like(points), np.zeros(len(points))
+    for axis, side in itertools.product(range(3), range(2)):
+        members = ends[:, axis, side]
+        if jitter:
+            flat = np.arange(3) == axis
+            face = (low, high)[side]
+            grid = _midpoints(
+                np.where(flat, face, low), np.where(flat, face, high), np.where(flat, 1, samples)
+            )
+            share = tributary_measures(points[members], *grid)
+        else:
+            share = np.prod(np.delete(lengths[members], axis, axis=1), axis=1)
+        areas[members] += share
+        normals[members, axis] += (2 * side - 1) * share
+    boundary = np.any(outer, axis=1)
     normals[boundary] /= np.linalg.norm(normals[boundary], axis=1, keepdims=True)
-    tags = np.where(boundary, 1 + np.argmax(faces, axis=1), INTERIOR).astype(np.int32)
     return NodeCloud(
         points=points,
         normals=normals,
         volumes=volumes,
-        areas=face_areas.sum(axis=1),
-        tags=tags,
+        areas=areas,
+        boundary=boundary,
         spacing=np.full(len(points), step.max()),
         surface=_lattice_surface(points, n),
     )
-
-
-def _face_areas(
-    points: Array,
-    faces: NDArray[np.bool_],
-    weights: Array | None,
-    corners: tuple[Array, Array],
-    cells: NDArray[np.int64],
-) -> Array:
-    """(n_nodes, 6), m²: the part of each face of the box (x-, x+, y-, ...) that each node stands for.
-
-    By the trapezoid rule's weights (n_nodes, 3), m, if given; else by the nearest node, in samples of `cells` an axis.
-    """
-    areas = np.zeros((len(points), 6))
-    for face in range(6):
-        members, axis = faces[:, face], face // 2
-        if weights is not None:
-            areas[members, face] = np.prod(np.delete(weights[members], axis, axis=1), axis=1)
-            continue
-        low, high, fine = corners[0].copy(), corners[1].copy(), cells.copy()
-        low[axis] = high[axis] = corners[face % 2][axis]
-        fine[axis] = 1
-        areas[members, face] = tributary_measures(points[members], *_midpoints(low, high, fine))
-    return areas
 
 
 def ball(radius_m: float, spacing_m: float) -> NodeCloud:
@@ -101,12 +83,9 @@ def ball(radius_m: float, spacing_m: float) -> NodeCloud:
     them. Volumes and areas are those of the points of the ball and of the sphere nearest to the node, from
     samples 1/8 spacing apart; they sum to 4/3 pi radius³ and 4 pi radius².
 
-    Raises ValueError when the spacing is not between 0 and half the radius.
+    radius_m   > 0
+    spacing_m  > 0, at most half the radius
     """
-    if not (np.isfinite(radius_m) and radius_m > 0):
-        raise ValueError(f"radius_m = {radius_m}: expected a length above 0")
-    if not 0 < spacing_m <= radius_m / 2:
-        raise ValueError(f"spacing_m = {spacing_m}: expected above 0 and at most half the radius {radius_m}")
     area, volume = 4 * np.pi * radius_m**2, 4 / 3 * np.pi * radius_m**3
     directions = _spiral(round(area / spacing_m**2))
     interior = _grid_in_ball(radius_m - 0.6 * spacing_m, spacing_m, offset=0.0)
@@ -129,17 +108,10 @@ def ball(radius_m: float, spacing_m: float) -> NodeCloud:
         normals=normals,
         volumes=tributary_measures(points, samples, np.ones(len(samples)), volume),
         areas=areas,
-        tags=np.where(on_surface, 1, INTERIOR).astype(np.int32),
+        boundary=on_surface,
         spacing=np.full(len(points), spacing_m),
         surface=TriangleSurface(vertices=radius_m * directions, triangles=hull.astype(np.int32)),
     )
-
-
-def _check_box(low: Array, high: Array) -> None:
-    if low.shape != (3,) or high.shape != (3,) or not np.all(np.isfinite([low, high])) or np.any(low >= high):
-        raise ValueError(
-            f"lower = {low.tolist()}, upper = {high.tolist()}: expected finite corners with lower < upper"
-        )
 
 
 def _lattice_index(counts: NDArray[np.int64]) -> NDArray[np.int64]:

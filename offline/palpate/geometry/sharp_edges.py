@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import igl
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.geometry.cloud import TriangleSurface
-from palpate.geometry.measures import triangle_normals
 
 Indices = NDArray[np.int64]
 
 SHARP_RAD = np.deg2rad(50.0)
-"""Turn of the normal, or of an edge's direction, from which on it counts as sharp."""
+"""Smallest turn of the normal, or of an edge's direction, that counts as sharp."""
 
 
 def sharp_edges(surface: TriangleSurface) -> tuple[Indices, Indices]:
@@ -19,17 +19,9 @@ def sharp_edges(surface: TriangleSurface) -> tuple[Indices, Indices]:
 
     A corner is where sharp edges end, fork, or turn by 50 degrees or more. The surface must be closed and oriented.
     """
-    triangles = surface.triangles.astype(np.int64)
-    directed = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    owner = np.tile(np.arange(len(triangles)), 3)
-    forward = directed[:, 0] < directed[:, 1]
-    order = np.lexsort(directed[forward].T)
-    reverse_order = np.lexsort(directed[~forward][:, ::-1].T)
-    edges = directed[forward][order]
-    normals, _ = triangle_normals(surface)
-    left, right = normals[owner[forward][order]], normals[owner[~forward][reverse_order]]
-    edges = edges[np.einsum("ei,ei->e", left, right) <= np.cos(SHARP_RAD)]
-
+    edges = igl.sharp_edges(surface.vertices, surface.triangles.astype(np.int64), float(SHARP_RAD))
+    edges = np.sort(edges, axis=1)
+    edges = edges[np.lexsort(edges.T)]  # whatever order the library has: nodes are placed in this one
     directions = surface.vertices[edges[:, 1]] - surface.vertices[edges[:, 0]]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     ends = np.concatenate([edges[:, 0], edges[:, 1]])

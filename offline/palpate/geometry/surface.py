@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -12,10 +11,7 @@ from palpate.geometry.cloud import TriangleSurface
 from palpate.geometry.readers import ReadError, read_polygons
 from palpate.geometry.soundness import Naming, SurfaceError, check_surface
 from palpate.geometry.triangulation import MERGE_TOLERANCE, triangulate, weld
-from palpate.scene.quantities import LONGEST_M, SHORTEST_M
-
-LengthUnit = Literal["m", "cm", "mm"]
-UNITS_M: dict[LengthUnit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+from palpate.scene.quantities import LONGEST_M, SHORTEST_M, UNITS_M, LengthUnit
 
 
 @dataclass(frozen=True)

@@ -62,8 +62,9 @@ def _cut_quads(quads: Array) -> tuple[Indices, NDArray[np.bool_]]:
     normal = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
     a, b, c = np.moveaxis(quads[:, _DIAGONALS], 3, 0)  # (n, 2 diagonals, 2 triangles, 3)
     along = np.einsum("ndti,ni->ndt", np.cross(b - a, c - a), normal)
-    whole = np.all(along >= 0, axis=2)  # both halves look where the quadrilateral looks
-    return _DIAGONALS[np.where(whole[:, 0], 0, 1)], ~whole.any(axis=1)
+    smaller = along.min(axis=2)  # half of each cut, negative where it faces the other way
+    best = np.argmax(smaller, axis=1)
+    return _DIAGONALS[best], np.max(smaller, axis=1) < 0
 
 
 def _clip_ears(outline: Array) -> Indices | None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from palpate.scene.quantities import UNITS_M
 from palpate.scene.schema import Config, SurfaceGeometry
 
 _SMALLEST_BODY_M, _LARGEST_BODY_M = 0.003, 1.0
@@ -39,7 +40,6 @@ _USUAL = {
     "period_s": _Usual(2e-4, 5e-3, "s", "force feedback has", (("ms", 1e-3), ("µs", 1e-6))),
     "tolerance": _Usual(1e-6, 0.2, "", "a usable model has", (("percent", 0.01),)),
 }
-_LENGTH_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 def plausibility(config: Config, size_m: float) -> tuple[str, ...]:
@@ -60,8 +60,8 @@ def _size(config: Config, size_m: float) -> Iterator[str]:
         return
     likely = [
         f'"{unit}"'
-        for unit, length in _LENGTH_UNITS.items()
-        if _SMALLEST_BODY_M <= size_m * length / _LENGTH_UNITS[geometry.file_unit] <= _LARGEST_BODY_M
+        for unit, length in UNITS_M.items()
+        if _SMALLEST_BODY_M <= size_m * length / UNITS_M[geometry.file_unit] <= _LARGEST_BODY_M
     ]
     advice = (
         f"; probably meant: file_unit = {' or '.join(likely)}" if likely else "; check the unit of the file"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -15,6 +15,13 @@ class Table(BaseModel):
 
 SHORTEST_M, LONGEST_M = 1e-6, 1e4
 """Lengths of bodies and of their parts."""
+
+MAX_NODES = 200_000
+"""More nodes than this are a slip in a unit."""
+
+LengthUnit = Literal["m", "cm", "mm"]
+UNITS_M: dict[LengthUnit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""The units that a surface file may be in, each with its length, m."""
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Count = Annotated[int, Field(strict=True, le=10**9)]

@@ -13,14 +13,10 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator, mo
 
 from palpate.model_file import LONGEST_PERIOD_S, SHORTEST_PERIOD_S
 from palpate.scene.material import PRESETS, Material, PronySeries, check_constant
-from palpate.scene.quantities import SHORTEST_M, Count, Length, Number, Point, Table
+from palpate.scene.quantities import MAX_NODES, SHORTEST_M, Count, Length, LengthUnit, Number, Point, Table
 from palpate.scene.regions import Region
 
 ReductionMethod = Literal["tbr", "tbr-band", "hankel-optimal", "modal", "modal-static"]
-
-
-MAX_NODES = 100_000
-"""More than this is a slip in a unit: all modes of a tenth of it do not fit into any memory."""
 
 _SHORTEST_TAU_IN_PERIODS = 0.01
 """A relaxation so much faster than the sampling is a damper, not a branch, and drowns in round-off."""
@@ -63,10 +59,10 @@ class BallGeometry(Table):
     @model_validator(mode="after")
     def _is_of_a_size(self) -> BallGeometry:
         nodes = 4 / 3 * math.pi * (self.radius_m / self.spacing_m) ** 3
-        if not 8 <= nodes <= MAX_NODES:
+        if self.spacing_m > self.radius_m / 2 or nodes > MAX_NODES:
             raise ValueError(
                 f"spacing_m = {self.spacing_m:g} in a ball of radius_m = {self.radius_m:g} makes about {nodes:.3g} nodes: "
-                f"expected from 8 to {MAX_NODES:,}"
+                f"expected at most half the radius, and at most {MAX_NODES:,} nodes"
             )
         return self
 
@@ -76,7 +72,7 @@ class SurfaceGeometry(Table):
 
     shape: Literal["surface"]
     file: str = Field(description="STL, OBJ or PLY, relative to the configuration")
-    file_unit: Literal["m", "cm", "mm"] = Field(default="m", description="unit of the file's coordinates")
+    file_unit: LengthUnit = Field(default="m", description="unit of the file's coordinates")
     spacing_m: Length
     growth: Number = Field(
         default=0.3, gt=0, le=0.5, description="growth of the spacing per meter away from a refined contact"

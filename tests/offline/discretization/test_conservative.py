@@ -73,7 +73,7 @@ CLOUDS = {
     "graded": lambda: fill_surface(
         box_lattice((-1, -1, -1), (1, 1, 1), (2, 2, 2)).surface,
         0.5,
-        (Refinement((0.2, 0.1, 1.0), 0.2, 0.1, growth=0.4, rings=True),),
+        (Refinement((0.2, 0.1, 1.0), 0.2, 0.1, growth=0.4),),
     ),
 }
 
@@ -140,7 +140,7 @@ def test_vector_areas_obey_the_divergence_theorem(cloud):
 
 def test_the_divergence_theorem_holds_to_local_round_off_where_spacing_spans_a_factor_of_twenty():
     surface = box_lattice((-20, -20, -20), (20, 20, 0), (2, 2, 2)).surface
-    cloud = fill_surface(surface, 5.0, (Refinement((0.0, 0.0, 0.0), 0.5, 0.25, growth=0.5, rings=True),))
+    cloud = fill_surface(surface, 5.0, (Refinement((0.0, 0.0, 0.0), 0.5, 0.25, growth=0.5),))
     assert cloud.spacing.max() / cloud.spacing.min() > 15
     basis, gradient = conservative.gradient_at_nodes(cloud)
     target = basis.value.T @ vector_areas(cloud)

@@ -15,7 +15,7 @@ from palpate.geometry.spacing import Refinement, SpacingField
 
 RADIUS = 0.1
 BLOCK = box_lattice((-0.05, -0.05, -0.06), (0.05, 0.05, 0.0), (2, 2, 2)).surface
-TIP = Refinement(center_m=(0.0, 0.0, 0.01), radius_m=0.007, spacing_m=0.0025, growth=0.3, rings=True)
+TIP = Refinement(center_m=(0.0, 0.0, 0.01), radius_m=0.007, spacing_m=0.0025, growth=0.3)
 
 
 def from_trimesh(mesh):
@@ -133,7 +133,7 @@ def test_the_nodes_of_a_round_patch_stand_for_its_disc(block):
 
 def test_a_patch_on_a_curved_surface_keeps_its_radii():
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
-    asked = Refinement((0.03, -0.04, 0.2), 0.025, 0.01, rings=True)
+    asked = Refinement((0.03, -0.04, 0.2), 0.025, 0.01)
     cloud = fill_surface(from_trimesh(mesh), 0.025, [asked])
     center, _ = closest_point(np.array([asked.center_m]), cloud.surface.vertices, cloud.surface.triangles)
     radius = np.linalg.norm(cloud.points[cloud.boundary] - center, axis=1)
@@ -147,7 +147,7 @@ def test_a_patch_on_a_curved_surface_keeps_its_radii():
 def test_the_same_seed_gives_the_same_cloud_and_another_seed_another(ball):
     again = fill_surface(ball.surface, 0.025, seed=0)
     other = fill_surface(ball.surface, 0.025, seed=1)
-    for name in ("points", "volumes", "areas", "normals", "tags", "spacing"):
+    for name in ("points", "volumes", "areas", "normals", "boundary", "spacing"):
         np.testing.assert_array_equal(getattr(again, name), getattr(ball, name))
     assert not np.array_equal(other.points, ball.points)
 
@@ -172,32 +172,17 @@ def test_a_thin_wedge_leaves_no_node_without_a_volume():
 @pytest.mark.parametrize(
     ("spacing", "refinements", "message"),
     [
-        (0.0, [], "spacing_m = 0.0: expected a length above 0"),
         (
             0.05,
             [],
             "spacing_m = 0.05: expected at most a quarter of the body's largest extent, 0.1 x 0.1 x 0.06 m",
         ),
-        (1e-5, [], "spacing_m = 1e-05 would give some 6e[+]11 nodes .* expected at most 200000"),
+        (1e-5, [], "spacing_m = 1e-05 would give some 6e[+]11 nodes .* expected at most 200,000"),
         (0.01, [Refinement((0, 0, 0), 0.02, 1e-5)], "would give some .* nodes"),
-        (0.01, [TIP, Refinement((0.005, 0, 0), 0.006, 0.002, rings=True)], "two round patches overlap near"),
-        (0.02, [Refinement((0, 0, 0), 0.2, 0.02, rings=True)], "radius 0.2 m finds no place around"),
+        (0.01, [TIP, Refinement((0.005, 0, 0), 0.006, 0.002)], "two round patches overlap near"),
+        (0.02, [Refinement((0, 0, 0), 0.2, 0.02)], "radius 0.2 m finds no place around"),
     ],
 )
 def test_a_fill_that_makes_no_sense_is_refused(spacing, refinements, message):
     with pytest.raises(ValueError, match=message):
         fill_surface(BLOCK, spacing, refinements)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (((0, 0, np.inf), 1, 1), "center_m"),
-        (((0, 0, 0), 0, 1), "radius_m = 0"),
-        (((0, 0, 0), 1, -1), "spacing_m = -1"),
-        (((0, 0, 0), 1, 1, 0.6), "growth = 0.6: expected 0 < growth <= 0.5"),
-    ],
-)
-def test_a_refinement_that_makes_no_sense_is_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        Refinement(*arguments)

@@ -13,7 +13,8 @@ from palpate.geometry.measures import enclosed_volume, triangle_normals
 from palpate.geometry.shapes import box_lattice
 from palpate.geometry.sharp_edges import sharp_edges
 from palpate.geometry.soundness import Naming, SurfaceError, check_surface
-from palpate.geometry.surface import UNITS_M, load_surface
+from palpate.geometry.surface import load_surface
+from palpate.scene.quantities import UNITS_M
 
 BOX = box_lattice((0, 0, 0), (1, 2, 3), (2, 2, 2)).surface
 

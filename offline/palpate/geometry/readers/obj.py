@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from palpate.geometry.readers.polygons import (
     Polygons,
     ReadError,
+    indexed_polygons,
     numbered_lines,
     parse_index,
     parse_point,
@@ -18,28 +17,16 @@ from palpate.geometry.readers.polygons import (
 def read_obj(data: bytes) -> Polygons:
     """The faces of an OBJ file. Raises ReadError."""
     vertices: list[tuple[float, float, float]] = []
-    corners: list[int] = []
-    sizes: list[int] = []
+    faces: list[list[int]] = []
     lines: list[int] = []  # of each face
     for number, words in _statements(data):
         if words[0] == "v":
             # A weight or a color may follow the three coordinates.
             vertices.append(parse_point(words[1:4], number))
         elif words[0] in ("f", "fo"):
-            if len(words) < 4:
-                raise ReadError(f"line {number}: a face with {len(words) - 1} vertices, expected at least 3")
-            corners += [_vertex(word, len(vertices), number) for word in words[1:]]
-            sizes.append(len(words) - 1)
+            faces.append([_vertex(word, len(vertices), number) for word in words[1:]])
             lines.append(number)
-    index = np.array(corners, dtype=np.int64)
-    beyond = np.flatnonzero(index >= len(vertices))
-    if len(beyond):
-        face = int(np.searchsorted(np.cumsum(sizes), beyond[0], side="right"))
-        raise ReadError(
-            f"line {lines[face]}: a face names vertex {index[beyond[0]] + 1:,}, but the file has {len(vertices):,} vertices"
-        )
-    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    return Polygons(points, index, np.array(sizes, dtype=np.int64), first=1, indexed=True)
+    return indexed_polygons(vertices, faces, first=1, name=lambda face: f"line {lines[face]}: a face")
 
 
 def _statements(data: bytes) -> Iterator[tuple[int, list[str]]]:
@@ -47,8 +34,7 @@ def _statements(data: bytes) -> Iterator[tuple[int, list[str]]]:
     start, pending = 0, ""
     for number, line in numbered_lines(data):
         line = line.split("#", 1)[0].rstrip()
-        if not pending:
-            start = number
+        start = start if pending else number
         pending += line.removesuffix("\\") + " "
         if not line.endswith("\\"):
             if words := pending.split():
@@ -61,10 +47,8 @@ def _statements(data: bytes) -> Iterator[tuple[int, list[str]]]:
 def _vertex(word: str, n_vertices: int, line: int) -> int:
     """Index from 0 of the vertex that `v`, `v/vt`, `v//vn` or `v/vt/vn` names; negative numbers count from the last."""
     index = parse_index(word.split("/", 1)[0], line)
-    if index > 0:
-        return index - 1
-    if index == 0 or -index > n_vertices:
+    if index < -n_vertices:
         raise ReadError(
-            f"line {line}: a face names vertex {index}, expected from 1, or from -1 down to -{n_vertices:,}"
+            f"line {line}: a face names vertex {index}, but {n_vertices:,} vertices come before it"
         )
-    return n_vertices + index
+    return n_vertices + index if index < 0 else index - 1

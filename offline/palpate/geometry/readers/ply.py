@@ -7,16 +7,12 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-
-import numpy as np
-from numpy.typing import NDArray
 
 from palpate.geometry.readers.polygons import (
     Polygons,
     ReadError,
-    check_finite,
+    indexed_polygons,
     numbered_lines,
     parse_index,
     parse_number,
@@ -76,27 +72,10 @@ def read_ply(data: bytes) -> Polygons:
             "the header has no element 'face' with a list of whole numbers 'vertex_indices': expected a surface with "
             "faces, not points or strips"
         )
-    points = np.array(
-        [[row[axis][0] for axis in axes if axis is not None] for row in rows["vertex"]], np.float64
+    points = [[row[axis][0] for axis in axes if axis is not None] for row in rows["vertex"]]
+    return indexed_polygons(
+        points, [row[column] for row in rows["face"]], first=0, name=lambda i: f"face {i}"
     )
-    return _polygons(points.reshape(-1, 3), [row[column] for row in rows["face"]])
-
-
-def _polygons(vertices: NDArray[np.float64], faces: Sequence[tuple[float, ...]]) -> Polygons:
-    """The faces, if each has three vertices or more, all of which exist."""
-    check_finite(vertices, "vertex {}")
-    sizes = np.array([len(face) for face in faces], np.int64)
-    corners = np.array([corner for face in faces for corner in face], np.int64)
-    small = np.flatnonzero(sizes < 3)
-    if len(small):
-        raise ReadError(f"face {small[0]} has {sizes[small[0]]} vertices, expected at least 3")
-    beyond = np.flatnonzero((corners < 0) | (corners >= len(vertices)))
-    if len(beyond):
-        face = np.searchsorted(np.cumsum(sizes), beyond[0], side="right")
-        raise ReadError(
-            f"face {face} names vertex {corners[beyond[0]]}, but the file has vertices from 0 to {len(vertices) - 1}"
-        )
-    return Polygons(vertices, corners, sizes, first=0, indexed=True)
 
 
 def _header(header: bytes) -> tuple[str, list[_Element]]:
@@ -116,7 +95,7 @@ def _header(header: bytes) -> tuple[str, list[_Element]]:
             case ["property", code, name] if elements and code in _CODES:
                 elements[-1].properties.append(_Property(name, _CODES[code]))
             case _:
-                raise ReadError(f"line {number}: {line[:60]!r} is no line of a PLY header")
+                raise ReadError(f"line {number}: {line[:60]!r} does not belong in a PLY header")
     if order is None:
         raise ReadError(f"the header states no format, expected one of {', '.join(_BYTE_ORDERS)} and 1.0")
     return order, elements

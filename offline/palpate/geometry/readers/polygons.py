@@ -1,16 +1,16 @@
-"""What every reader of a surface file returns, and the words they share."""
+"""What every reader of a surface file returns, and the parsing and checks that they share."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 LARGEST_COORDINATE = 1e30
-"""Beyond it, in whatever unit, a file is damaged; squares and cubes of what is below it are still finite."""
+"""Above it, in any unit, a file is damaged. Squares and cubes of smaller coordinates are finite."""
 
 
 class ReadError(ValueError):
@@ -22,9 +22,9 @@ class Polygons:
     """Faces as a file holds them.
 
     vertices  (n_vertices, 3), in the file's unit
-    corners   (sum of sizes,), indices of the vertices of all faces, one face after the other, from 0
-    sizes     (n_faces,), corners of each face, each at least 3
-    first     the number that the format gives the first vertex and face: 0 (PLY) or 1 (OBJ); STL numbers nothing, its
+    corners   (sum of sizes,), indices from 0 of the vertices of all faces, face after face
+    sizes     (n_faces,), corners of each face, at least 3
+    first     the number that the format gives the first vertex and face: 0 (PLY) or 1 (OBJ); STL has no numbers, its
               triangles are counted from 1
     indexed   whether vertices have numbers in the file (OBJ, PLY) or are repeated by every triangle (STL)
     """
@@ -36,8 +36,36 @@ class Polygons:
     indexed: bool
 
 
+def indexed_polygons(
+    vertices: ArrayLike, faces: Sequence[Sequence[float]], first: int, name: Callable[[int], str]
+) -> Polygons:
+    """Polygons of a format whose faces name vertices.
+
+    vertices  (n_vertices, 3)
+    faces     the vertices of each face, counted from 0
+    name      what to call the face of an index in a message
+
+    Raises ReadError unless coordinates are finite and each face has at least three vertices, all of which exist.
+    """
+    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+    check_finite(points, "vertex {}, counted from 0,")
+    sizes = np.array([len(face) for face in faces], dtype=np.int64)
+    corners = np.array([corner for face in faces for corner in face], dtype=np.int64)
+    small = np.flatnonzero(sizes < 3)
+    if len(small):
+        raise ReadError(f"{name(small[0])} with {sizes[small[0]]} vertices, expected at least 3")
+    wrong = np.flatnonzero((corners < 0) | (corners >= len(points)))
+    if len(wrong):
+        face = int(np.searchsorted(np.cumsum(sizes), wrong[0], side="right"))
+        raise ReadError(
+            f"{name(face)} names vertex {corners[wrong[0]] + first:,}, but the file has {len(points):,} vertices, counted "
+            f"from {first}"
+        )
+    return Polygons(points, corners, sizes, first, indexed=True)
+
+
 def numbered_lines(data: bytes) -> Iterator[tuple[int, str]]:
-    """The lines of a text file that are not empty, stripped, with their numbers from 1; LF, CRLF or CR.
+    """The non-empty lines of a text file, stripped, with their numbers from 1; LF, CRLF or CR.
 
     A name in the file may be in any encoding: bytes that are not ASCII are kept as Latin-1. Raises ReadError for UTF-16.
     """
@@ -68,13 +96,13 @@ def parse_number(word: str, line: int) -> float:
                 "exporting the file again with an English locale"
             ) from None
         raise ReadError(f"line {line}: {word!r} is not a number") from None
-    if not abs(value) <= LARGEST_COORDINATE:  # not a number compares false
+    if not abs(value) <= LARGEST_COORDINATE:  # also where it is not a number
         raise ReadError(f"line {line}: {word!r}: expected a finite coordinate below {LARGEST_COORDINATE:g}")
     return value
 
 
 def parse_index(word: str, line: int) -> int:
-    """A whole number. Raises ReadError naming the line and the word."""
+    """An integer. Raises ReadError naming the line and the word."""
     try:
         return int(word)
     except ValueError:

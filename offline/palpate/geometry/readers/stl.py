@@ -17,7 +17,7 @@ _UTF_MARKS = (b"\xef\xbb\xbf", b"\xff\xfe", b"\xfe\xff")
 
 def read_stl(data: bytes) -> Polygons:
     """The triangles of an STL file. Raises ReadError."""
-    # A binary file may begin with "solid" too, so its size is asked first.
+    # A binary file may begin with "solid" too, so its size decides first.
     if len(data) >= _HEADER_BYTES and len(data) == _HEADER_BYTES + _RECORD.itemsize * _stated_count(data):
         corners = np.frombuffer(data, _RECORD, offset=_HEADER_BYTES)["corners"].astype(np.float64)
     elif data.startswith(_UTF_MARKS) or _TEXT.match(data[:4096]):
@@ -51,38 +51,29 @@ def _what_is_wrong(data: bytes) -> str:
 def _read_text(data: bytes) -> NDArray[np.float64]:
     """Corners (n_triangles, 3, 3) of an ASCII file; it may hold several solids, and its last line may be missing."""
     corners: list[tuple[float, float, float]] = []
-    here = 0  # corners of the facet that is open
-    inside = False
-    number = 0
+    number, start, inside = 0, 0, False  # start: the first corner of the last facet
     for number, line in numbered_lines(data):
-        words = line.lower().split()
-        if words[0] == "end":  # some programs write "end facet"
-            words = ["".join(words[:2]), *words[2:]]
+        words = re.sub(r"^end\s+", "end", line.lower()).split()  # some programs write "end facet"
         match words[0]:
-            case "vertex":
-                if not inside:
-                    raise ReadError(f"line {number}: a vertex outside a facet")
+            case "vertex" if inside:
                 corners.append(parse_point(words[1:], number))
-                here += 1
-            case "facet":
-                if inside:
+            case "facet" if not inside:
+                inside, start = True, len(corners)
+            case "endfacet" if inside:
+                if len(corners) != start + 3:
                     raise ReadError(
-                        f"line {number}: a facet begins before the last one ended (no 'endfacet')"
+                        f"line {number}: a facet with {len(corners) - start} vertices, expected 3"
                     )
-                inside, here = True, 0
-            case "endfacet":
-                if not inside or here != 3:
-                    raise ReadError(f"line {number}: a facet with {here} vertices ends, expected 3")
                 inside = False
             case "outer" | "endloop":
                 pass
             case "solid" | "endsolid" if not inside:
                 pass
             case _:
-                raise ReadError(f"line {number}: {line[:40]!r} is no line of an STL file")
+                where = "inside" if inside else "outside"
+                raise ReadError(f"line {number}: {line[:40]!r} does not belong {where} a facet")
     if inside:
         raise ReadError(
-            f"truncated: line {number}, the last one, is within triangle {(len(corners) - here) // 3 + 1}: copy or export it "
-            "again"
+            f"truncated: line {number}, the last one, is within triangle {start // 3 + 1}: copy or export it again"
         )
     return np.array(corners, dtype=np.float64).reshape(-1, 3, 3)
