@@ -28,6 +28,7 @@ from palpate.model_file.members import (
 )
 from palpate.model_file.types import (
     FORMAT,
+    SCALARS,
     SCHEMA_VERSION,
     UNITS,
     AccuracyReport,
@@ -78,17 +79,16 @@ def load_model(path: Path) -> ReducedModel:
 def _read(file: IO[bytes]) -> ReducedModel:
     _check_directory(file)
     with zipfile.ZipFile(file) as archive:
-        members = _members(archive)
-        scalars = _metadata(archive, members)
-        for name in members:
-            if name not in (METADATA, CHECKSUM, *ARRAYS):
-                raise ModelFileError(
-                    f"field '{printable(name, 80)}' is unknown: expected none beside a model's"
-                )
-        headers = {name: _open(archive, members, name)[1] for name in ARRAYS}
-        check_shapes(headers)
-        arrays = _data(archive, members)
-    return _assemble(scalars, arrays)
+        _check_sizes(archive)
+        metadata = _metadata(archive)
+        known = {f"{name}.npy" for name in (METADATA, CHECKSUM, *ARRAYS)}
+        for member in archive.namelist():
+            if member not in known:
+                shown = printable(member.removesuffix(".npy"), 80)
+                raise ModelFileError(f"field '{shown}' is unknown: expected none beside a model's")
+        check_shapes({name: _open(archive, name)[1] for name in ARRAYS})
+        arrays = _arrays(archive)
+    return _assemble(metadata, arrays)
 
 
 def _check_directory(file: IO[bytes]) -> None:
@@ -103,35 +103,28 @@ def _check_directory(file: IO[bytes]) -> None:
         raise ModelFileError(f"damaged: its zip directory is longer than {_MAX_DIRECTORY_BYTES} bytes")
 
 
-def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """The members by name, without `.npy`; their declared sizes are within bounds."""
-    members: dict[str, zipfile.ZipInfo] = {}
-    for entry in archive.infolist():
-        name = entry.filename.removesuffix(".npy")
-        if name in members:
-            raise ModelFileError(f"field '{printable(name, 80)}' is there twice: expected it once")
+def _check_sizes(archive: zipfile.ZipFile) -> None:
+    """Check that each member is there once, in plain form, and that the declared sizes are within bounds."""
+    entries = archive.infolist()
+    for entry in entries:
+        shown = printable(entry.filename.removesuffix(".npy"), 80)
+        if archive.getinfo(entry.filename) is not entry:
+            raise ModelFileError(f"field '{shown}' is there twice: expected it once")
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or entry.flag_bits & ~0x800:
-            raise ModelFileError(
-                f"field '{printable(name, 80)}' is packed otherwise: expected stored or deflated"
-            )
-        members[name] = entry
-    if METADATA not in members:
-        raise ModelFileError("field 'metadata' is missing: not a palpate model")
-    total = sum(entry.file_size for entry in members.values())
+            raise ModelFileError(f"field '{shown}' is packed otherwise: expected stored or deflated")
+    total = sum(entry.file_size for entry in entries)
     if total > MAX_TOTAL_BYTES:
         raise ModelFileError(f"its members unpack to {total:,} bytes: expected at most {MAX_TOTAL_BYTES:,}")
-    if members[METADATA].file_size > MAX_METADATA_BYTES:
-        raise refuse(METADATA, f"{members[METADATA].file_size:,} bytes", f"at most {MAX_METADATA_BYTES:,}")
-    return members
 
 
-def _open(
-    archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], name: str
-) -> tuple[IO[bytes], Header, bytes]:
+def _open(archive: zipfile.ZipFile, name: str) -> tuple[IO[bytes], Header, bytes]:
     """(stream at the first byte of the data, header, header's bytes) of a member whose size is what it declares."""
-    if name not in members:
-        raise ModelFileError(f"field '{name}' is missing")
-    stream = archive.open(members[name])
+    try:
+        entry = archive.getinfo(f"{name}.npy")
+    except KeyError:
+        hint = ": not a palpate model" if name == METADATA else ""
+        raise ModelFileError(f"field '{name}' is missing{hint}") from None
+    stream = archive.open(entry)
     opening = stream.read(10)
     length = int.from_bytes(opening[8:], "little")
     text = stream.read(length) if length <= _MAX_HEADER_BYTES else b""
@@ -142,18 +135,14 @@ def _open(
         )
     shape = tuple(int(n) for n in match[2].replace(b" ", b"").split(b",") if n)
     header = Header(match[1].decode(), shape)
-    if len(opening) + length + header.n_bytes != members[name].file_size:
-        raise refuse(
-            name, header, f"an array of the {members[name].file_size:,} bytes that the archive declares"
-        )
+    if len(opening) + length + header.n_bytes != entry.file_size:
+        raise refuse(name, header, f"an array of the {entry.file_size:,} bytes that the archive declares")
     return stream, header, opening + text
 
 
-def _take(
-    archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], name: str, digest: Any
-) -> NDArray[Any]:
+def _take(archive: zipfile.ZipFile, name: str, digest: Any) -> NDArray[Any]:
     """The array of a member; `digest` takes in its name and bytes."""
-    stream, header, opening = _open(archive, members, name)
+    stream, header, opening = _open(archive, name)
     digest.update(name.encode() + b"\0" + opening)
     array = np.empty(header.shape, dtype=header.dtype)
     data = array.reshape(-1).view(np.uint8).data
@@ -168,26 +157,28 @@ def _take(
     return array
 
 
-def _bytes(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], name: str) -> bytes:
-    _, header, _ = _open(archive, members, name)
-    if header.dtype != "|u1" or len(header.shape) != 1:
-        raise refuse(name, header, "|u1 in one dimension")
-    return _take(archive, members, name, hashlib.sha256()).tobytes()
+def _bytes(archive: zipfile.ZipFile, name: str) -> bytes:
+    """The data of a member that is text or a checksum."""
+    _, header, _ = _open(archive, name)
+    if header.dtype != "|u1" or len(header.shape) != 1 or header.n_bytes > MAX_METADATA_BYTES:
+        raise refuse(name, header, f"|u1 in one dimension, of at most {MAX_METADATA_BYTES:,} bytes")
+    return _take(archive, name, hashlib.sha256()).tobytes()
 
 
-def _data(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]) -> dict[str, NDArray[Any]]:
-    """The arrays, once the checksum of all members has been found right."""
+def _arrays(archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
+    """The arrays. Raises ModelFileError where the checksum of all members is wrong."""
     digest = hashlib.sha256()
-    arrays = {name: _take(archive, members, name, digest) for name in sorted([*ARRAYS, METADATA])}
-    if _bytes(archive, members, CHECKSUM) != digest.digest():
+    arrays = {name: _take(archive, name, digest) for name in sorted([*ARRAYS, METADATA])}
+    if _bytes(archive, CHECKSUM) != digest.digest():
         raise ModelFileError(
             "field 'sha256' is not the checksum of the content: the file is damaged, build it again"
         )
     return arrays
 
 
-def _metadata(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]) -> dict[str, Any]:
-    text = _bytes(archive, members, METADATA)
+def _metadata(archive: zipfile.ZipFile) -> dict[str, Any]:
+    """The metadata, of this format, schema and kind; its values have not been checked yet."""
+    text = _bytes(archive, METADATA)
     try:
         scalars = json.loads(text.decode())
     except (ValueError, RecursionError) as error:
@@ -214,17 +205,7 @@ def _metadata(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]) -> 
 
 def _assemble(scalars: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> ReducedModel:
     """The model, of parts whose values have not been checked yet."""
-    plain = [
-        "name",
-        "method",
-        "period_s",
-        "n_nodes",
-        "n_states_full",
-        "config",
-        "config_sha256",
-        "built_with",
-    ]
-    _exactly(scalars, "", ["format", "schema_version", "kind", "units", *plain, "contacts", "accuracy"])
+    _exactly(scalars, "", ["format", "schema_version", "kind", "units", *SCALARS, "contacts", "accuracy"])
     _exactly(scalars["units"], "units.", list(UNITS))
     for quantity, unit in UNITS.items():
         if scalars["units"][quantity] != unit:
@@ -235,7 +216,7 @@ def _assemble(scalars: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Reduc
     _exactly(scalars["accuracy"], "accuracy.", of_file)
     band = _numbers(scalars["accuracy"]["band_hz"], "accuracy.band_hz")
     return ReducedModel(
-        **{name: scalars[name] for name in plain},
+        **{name: scalars[name] for name in SCALARS},
         contacts=tuple(_contact(table, f"contacts[{i}].") for i, table in enumerate(scalars["contacts"])),
         continuous=_part(StateSpace, arrays, "continuous"),
         discrete=_part(StateSpace, arrays, "discrete"),

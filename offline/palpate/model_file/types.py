@@ -26,6 +26,11 @@ UNITS = {
     "pole": "1/s",
 }
 
+SCALARS = (
+    "name", "method", "period_s", "n_nodes", "n_states_full", "config", "config_sha256", "built_with",
+)  # fmt: skip
+"""The fields of `ReducedModel` that stand as they are in the metadata of a file."""
+
 Array = NDArray[np.float64]
 
 
@@ -183,27 +188,29 @@ class ReducedModel:
     def n_inputs(self) -> int:
         return 3 * len(self.contacts)
 
-    def summary(self) -> dict[str, Any]:
-        """What `palpate inspect --json` prints: plain numbers, lists and strings."""
+    def metadata(self) -> dict[str, Any]:
+        """All but the arrays, as a file holds it: plain numbers, lists and strings."""
         accuracy = asdict(self.accuracy)
-        accuracy["hankel_singular_values"] = self.accuracy.hankel_singular_values.tolist()
+        del accuracy["hankel_singular_values"]
         return {
             "format": FORMAT,
             "schema_version": SCHEMA_VERSION,
             "kind": self.kind,
-            "name": self.name,
-            "method": self.method,
+            "units": UNITS,
+            **{name: getattr(self, name) for name in SCALARS},
+            "contacts": [asdict(contact) for contact in self.contacts],
+            "accuracy": accuracy,
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """What `palpate inspect --json` prints: the metadata without the scene, and what is short of the arrays."""
+        metadata = self.metadata()
+        del metadata["config"]
+        metadata["accuracy"]["hankel_singular_values"] = self.accuracy.hankel_singular_values.tolist()
+        return metadata | {
             "order": self.order,
-            "n_nodes": self.n_nodes,
-            "n_states_full": self.n_states_full,
-            "period_s": self.period_s,
-            "contacts": [asdict(c) for c in self.contacts],
             "static_stiffness_n_per_m": self.static_stiffness.tolist(),
             "instant_stiffness_n_per_m": self.continuous.d.tolist(),
             "n_surface_vertices": len(self.surface.vertices),
             "n_surface_triangles": len(self.surface.triangles),
-            "units": UNITS,
-            "config_sha256": self.config_sha256,
-            "built_with": self.built_with,
-            "accuracy": accuracy,
         }

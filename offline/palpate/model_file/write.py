@@ -7,7 +7,6 @@ import io
 import json
 import zipfile
 from collections.abc import Iterable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from palpate.files import write_atomically
 from palpate.model_file.check import check_model
 from palpate.model_file.members import ARRAYS, CHECKSUM, METADATA, arrays_of
-from palpate.model_file.types import FORMAT, SCHEMA_VERSION, UNITS, ReducedModel
+from palpate.model_file.types import ReducedModel
 
 
 def save_model(model: ReducedModel, path: Path, inputs: Iterable[Path] = ()) -> None:
@@ -29,7 +28,7 @@ def save_model(model: ReducedModel, path: Path, inputs: Iterable[Path] = ()) -> 
     """
     check_model(model)
     members = {name: _npy(array, ARRAYS[name][0]) for name, array in arrays_of(model).items()}
-    metadata = json.dumps(_metadata(model), allow_nan=False).encode()
+    metadata = json.dumps(model.metadata(), allow_nan=False).encode()
     members[METADATA] = _npy(np.frombuffer(metadata, np.uint8), "|u1")
 
     digest = hashlib.sha256()
@@ -40,27 +39,6 @@ def save_model(model: ReducedModel, path: Path, inputs: Iterable[Path] = ()) -> 
             archive.writestr(_entry(name), members[name], compresslevel=1)  # mantissas hardly get smaller
         archive.writestr(_entry(CHECKSUM), _npy(np.frombuffer(digest.digest(), np.uint8), "|u1"))
     write_atomically(path, buffer.getvalue(), inputs)
-
-
-def _metadata(model: ReducedModel) -> dict[str, Any]:
-    accuracy = asdict(model.accuracy)
-    del accuracy["hankel_singular_values"]
-    return {
-        "format": FORMAT,
-        "schema_version": SCHEMA_VERSION,
-        "kind": model.kind,
-        "units": UNITS,
-        "name": model.name,
-        "method": model.method,
-        "period_s": model.period_s,
-        "n_nodes": model.n_nodes,
-        "n_states_full": model.n_states_full,
-        "contacts": [asdict(c) for c in model.contacts],
-        "accuracy": accuracy,
-        "config": model.config,
-        "config_sha256": model.config_sha256,
-        "built_with": model.built_with,
-    }
 
 
 def _npy(array: NDArray[Any], dtype: str) -> bytes:
