@@ -1,4 +1,4 @@
-"""Numbers of a scene that look as if they were given in another unit: warnings, since unusual bodies exist."""
+"""Numbers of a scene that look as if they were given in another unit. They are warnings: unusual bodies exist."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from palpate.scene.quantities import UNITS_M
+from palpate.scene.quantities import UNITS_M, Table
 from palpate.scene.schema import Config, SurfaceGeometry
 
 _SMALLEST_BODY_M, _LARGEST_BODY_M = 0.003, 1.0
@@ -70,30 +70,23 @@ def _size(config: Config, size_m: float) -> Iterator[str]:
 
 
 def _numbers(config: Config) -> Iterator[str]:
-    material, reduction = config.material, config.reduction
-    # The constants of a preset are not the user's.
-    for key in ("youngs_modulus_pa", "density_kg_per_m3", "poissons_ratio"):
-        yield from _unusual(f"material.{key}", getattr(material, key))
-    for key in ("gamma", "tau_s"):
-        for value in getattr(material, key) or ():
-            yield from _unusual(f"material.{key}", value)
-    for key in ("radius_m", "spacing_m"):
-        yield from _unusual(f"geometry.{key}", getattr(config.geometry, key, None))
-    for contact in config.contact:
-        yield from _unusual(f"contact '{contact.name}'.radius_m", contact.radius_m)
-        yield from _unusual(f"contact '{contact.name}'.spacing_m", contact.spacing_m)
-    for index, region in enumerate(config.fixed):
-        yield from _unusual(f"fixed[{index}].radius_m", getattr(region, "radius_m", None))
-    yield from _unusual("reduction.band_hz", reduction.band_hz[1])
-    yield from _unusual("reduction.period_s", reduction.period_s)
-    yield from _unusual("reduction.tolerance", reduction.tolerance)
+    # The constants of a preset are not the user's, and not in the table.
+    tables: dict[str, Table] = {
+        "material": config.material,
+        "geometry": config.geometry,
+        "reduction": config.reduction,
+    }
+    tables |= {f"contact '{contact.name}'": contact for contact in config.contact}
+    tables |= {f"fixed[{index}]": region for index, region in enumerate(config.fixed)}
+    for where, table in tables.items():
+        for key, usual in _USUAL.items():
+            given = getattr(table, key, None)
+            for value in given if isinstance(given, tuple) else (given,):
+                if value is not None and not usual.low <= value <= usual.high:
+                    yield _unusual(f"{where}.{key}", value, usual)
 
 
-def _unusual(key: str, value: float | None) -> Iterator[str]:
-    """The warning about a number, if it is given and unusual."""
-    usual = _USUAL[key.rsplit(".", 1)[1]]
-    if value is None or usual.low <= value <= usual.high:
-        return
+def _unusual(key: str, value: float, usual: _Usual) -> str:
     meant = [
         f"{value * length:.3g} if it was in {name}"
         for name, length in usual.other_units
@@ -101,4 +94,4 @@ def _unusual(key: str, value: float | None) -> Iterator[str]:
     ]
     unit = f" {usual.unit}" if usual.unit else ""
     advice = f"; probably meant: {', '.join(meant)}" if meant else "; check its unit"
-    yield f"{key} = {value:g}{unit}: {usual.what} {usual.low:g} to {usual.high:g}{unit}{advice}"
+    return f"{key} = {value:g}{unit}: {usual.what} {usual.low:g} to {usual.high:g}{unit}{advice}"

@@ -121,13 +121,11 @@ class MaterialTable(Table):
         """The material itself. Raises ValueError naming what is missing or unknown."""
         if self.preset is not None and self.preset not in PRESETS:
             raise ValueError(f"preset = {self.preset!r}: expected one of {', '.join(sorted(PRESETS))}")
-        base = PRESETS[self.preset] if self.preset is not None else None
+        base = None if self.preset is None else PRESETS[self.preset]
         names = ("youngs_modulus_pa", "poissons_ratio", "density_kg_per_m3")
-        values = {n: getattr(self, n) for n in names}
-        if base is not None:
-            values = {n: getattr(base, n) if v is None else v for n, v in values.items()}
-        missing = [n for n, v in values.items() if v is None]
-        if missing:
+        constants = {n: getattr(base, n) for n in names} if base is not None else {}
+        constants |= self.model_dump(include=set(names), exclude_none=True)
+        if missing := [n for n in names if n not in constants]:
             raise ValueError(f"{', '.join(missing)} missing: give all constants, or a preset")
         if (self.gamma is None) != (self.tau_s is None):
             raise ValueError("gamma and tau_s belong together: give both or neither")
@@ -135,7 +133,7 @@ class MaterialTable(Table):
             prony = PronySeries(self.gamma, self.tau_s)
         else:
             prony = base.prony if base is not None else PronySeries()
-        return Material(**values, prony=prony)
+        return Material(**constants, prony=prony)
 
 
 class DiscretizationTable(Table):
@@ -227,7 +225,7 @@ def check_config(tables: dict[str, Any], origin: str) -> Config:
         return Config.model_validate(tables)
     except ValidationError as error:
         mistakes = error.errors()
-        # A list whose entries are wrong is also told to be too short: that follows, and helps nobody.
+        # pydantic also calls a list with a wrong entry too short.
         entries = {e["loc"][0] for e in mistakes if len(e["loc"]) > 1}
         told = [e for e in mistakes if not (e["type"] == "too_short" and e["loc"][0] in entries)]
         raise ConfigError("\n".join(f"{origin}: {_line(e)}" for e in told)) from error
@@ -267,56 +265,45 @@ def fingerprint(config: Config, folder: Path) -> str:
     return digest.hexdigest()
 
 
-_DISCRIMINATORS = {"box", "ball", "surface", "plane", "sphere", "nearest"}
-
-
-def _line(error: Any) -> str:
-    parts = [p for p in error["loc"] if p not in _DISCRIMINATORS]
-    key = ""
-    for part in parts:
-        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
-    key = key or "scene"
-    value = error["input"]
-    message = error["msg"].removeprefix("Value error, ")
-    if error["type"] == "tuple_type" and len(parts) == 1 and parts[0] in ("fixed", "contact"):
-        return f"{key}: expected a list of tables, [[{key}]]"
-    if error["type"] == "missing":
-        return f"{key}: missing, it is required"
-    if error["type"] == "extra_forbidden":
-        return f"{key}: unknown key; remove it or check its spelling"
-    if error["type"] in ("union_tag_invalid", "union_tag_not_found"):
-        context = error["ctx"]
-        tag = context["discriminator"].strip("'")
-        got = f" = {context['tag']!r}" if "tag" in context else ""
-        allowed = context.get("expected_tags")
-        if allowed is None:
-            allowed = "'box', 'plane', 'sphere', 'nearest'" if tag == "region" else "'box', 'ball', 'surface'"
-            return f"{key}.{tag}: missing, expected one of {allowed}"
-        return f"{key}.{tag}{got}: expected one of {allowed}"
-    if error["type"] == "value_error":
-        if parts and message.startswith(f"{parts[-1]} = "):  # a field's own words
-            return key.removesuffix(str(parts[-1])) + message
-        named = re.match(r"\w+ = ", message) and parts  # a table's words about one of its fields
-        return f"{key}.{message}" if named else f"{key}: {message}" if parts else message
-    expected = message.removeprefix("Input should be ")
-    if error["type"] in _BOUNDS:
-        (bound,) = error["ctx"].values()
-        expected = f"{_BOUNDS[error['type']]} {bound:g}{_unit_hint(str(parts[-1]))}"
-    elif expected == message:
-        return f"{key} = {value!r}: {message[0].lower() + message[1:]}"
-    return f"{key} = {value!r}: expected {expected}"
-
-
+_TAGS = {"shape": ("box", "ball", "surface"), "region": ("box", "plane", "sphere", "nearest")}
 _BOUNDS = {
     "greater_than": "above",
     "greater_than_equal": "at least",
     "less_than": "below",
     "less_than_equal": "at most",
 }
-_UNIT_HINTS = {"period_s": "in s: 1 ms is 0.001", "tolerance": "a fraction: 2 % is 0.02"}
+_UNIT_HINTS = {"period_s": " (in s: 1 ms is 0.001)", "tolerance": " (a fraction: 2 % is 0.02)"}
 
 
-def _unit_hint(key: str) -> str:
-    """The unit that a number is in."""
-    hint = _UNIT_HINTS.get(key) or ("in m: 5 mm is 0.005" if key.endswith("_m") else "")
-    return f" ({hint})" if hint else ""
+def _line(error: Any) -> str:
+    """One of pydantic's errors as a line: the key, the value and what was expected."""
+    parts = [part for part in error["loc"] if part not in (*_TAGS["shape"], *_TAGS["region"])]
+    key = ""
+    for part in parts:
+        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
+    key, last = key or "scene", str(parts[-1]) if parts else ""
+    value, message = error["input"], error["msg"].removeprefix("Value error, ")
+    match error["type"]:
+        case "tuple_type" if parts in (["fixed"], ["contact"]):
+            return f"{key}: expected a list of tables, [[{key}]]"
+        case "missing":
+            return f"{key}: missing, it is required"
+        case "extra_forbidden":
+            return f"{key}: unknown key; remove it or check its spelling"
+        case "union_tag_invalid" | "union_tag_not_found":
+            tag = error["ctx"]["discriminator"].strip("'")
+            got = f" = {error['ctx']['tag']!r}:" if "tag" in error["ctx"] else ": missing,"
+            return f"{key}.{tag}{got} expected one of {', '.join(map(repr, _TAGS[tag]))}"
+        case "value_error":
+            if last and message.startswith(f"{last} = "):  # a field's own words
+                return key.removesuffix(last) + message
+            named = re.match(r"\w+ = ", message) and parts  # a table's words about one of its fields
+            return f"{key}.{message}" if named else f"{key}: {message}" if parts else message
+        case bound if bound in _BOUNDS:
+            hint = _UNIT_HINTS.get(last, " (in m: 5 mm is 0.005)" if last.endswith("_m") else "")
+            (limit,) = error["ctx"].values()
+            return f"{key} = {value!r}: expected {_BOUNDS[bound]} {limit:g}{hint}"
+    expected = message.removeprefix("Input should be ")
+    if expected == message:
+        return f"{key} = {value!r}: {message[0].lower() + message[1:]}"
+    return f"{key} = {value!r}: expected {expected}"
