@@ -19,17 +19,17 @@ from palpate.lti.pole_residue import PoleResidueSystem
 Array = NDArray[np.float64]
 
 GRAMIAN_TOLERANCE = 1e-20
-"""Trace of what a Gramian factor leaves out, relative to the Gramian's. Hankel singular values are off by about its
-square root at worst, so this keeps them to 1e-10 of the largest."""
+"""Trace of what a Gramian factor leaves out, over the Gramian's. It moves a Hankel singular value by about the square root
+of this times the largest, 1e-10, at worst."""
 
 BAND_FREQUENCIES = 120
-"""Points over a band without narrow resonances, about; 30 panels, of a fraction of an octave each."""
+"""Approximate number of points over a band without narrow resonances: 30 panels, each a fraction of an octave."""
 
 _NARROW = 0.01
-"""|Re p| / |p| of poles whose resonance the panels of the band step over."""
+"""|Re p| / |p| below which the panels of the band are too wide for the resonance of the pole p."""
 
 _MOST_RESONANCES = 60
-"""Narrow resonances that get panels of their own, the narrowest first: each costs some tens of points."""
+"""Largest number of narrow resonances that get panels of their own, narrowest first: each costs some tens of points."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Gramians:
     """Factors of the two Gramians, control control^T and observe observe^T, in real coordinates.
 
     control (n_states, k), observe (n_states, l)
-    missing    what the Hankel singular values can differ by in sum from those of the whole Gramians
+    missing    bound on the sum of the differences between the Hankel singular values and those of the whole Gramians
     symmetric  whether observe is control times signs, so that observe^T control is symmetric
     """
 
@@ -87,20 +87,16 @@ class GramianFactor:
 
 def real_form(system: PoleResidueSystem) -> RealForm:
     """The system in real coordinates (exact; see the module's text)."""
-    start, is_pair = _first_state(system), system.is_pair
-    n = system.n_states
+    start, is_pair, n = _first_state(system), system.is_pair, system.n_states
     real, pair = start[~is_pair], start[is_pair]
-    decay, rotation, partner = np.empty(n), np.zeros(n), np.arange(n)
-    decay[real], decay[pair], decay[pair + 1] = (
-        system.poles.real[~is_pair],
-        system.poles.real[is_pair],
-        system.poles.real[is_pair],
-    )
-    rotation[pair], rotation[pair + 1] = -system.poles.imag[is_pair], system.poles.imag[is_pair]
+    sizes, second = np.where(is_pair, 2, 1), np.zeros(n, dtype=bool)
+    second[pair + 1] = True  # the second state of each pair
+    decay = np.repeat(system.poles.real, sizes)
+    rotation = np.repeat(system.poles.imag, sizes) * np.where(second, 1.0, -1.0)
+    partner = np.arange(n)
     partner[pair], partner[pair + 1] = pair + 1, pair
-    signature = np.ones(n)
-    signature[pair + 1] = -1.0
-    # Of a real pole the rows are real or imaginary (the square root of a real residue): j times j makes the sign.
+    signature = np.where(second, -1.0, 1.0)
+    # The rows of a real pole are real or imaginary, square roots of a real residue: j times j is the sign.
     rows = system.b[~is_pair]
     signature[real] = np.where(np.sum(rows.imag**2, axis=1) > np.sum(rows.real**2, axis=1), -1.0, 1.0)
     b = _in_real_coordinates(system, system.b)
@@ -108,37 +104,61 @@ def real_form(system: PoleResidueSystem) -> RealForm:
     return RealForm(decay, rotation, partner, b, c, system.d, signature)
 
 
-def controllability_factor(system: PoleResidueSystem, tolerance: float) -> GramianFactor:
+def gramians(system: PoleResidueSystem) -> Gramians:
+    """Factors of P, A P + P A^T + B B^T = 0, and of Q, A^T Q + Q A + C^T C = 0.
+
+    In real coordinates A^T = S A S with the signature S, so Q is S times the P of the rows of C^T times S: of a symmetric
+    system (C = B^T) one factor gives both. Raises ValueError as `gramian_factor`.
+    """
+    control = gramian_factor(system, system.b)
+    observe = control if system.is_symmetric else gramian_factor(system, system.c.T)
+    # The factors of the whole have more blocks, whose nuclear norms are at most the products of Frobenius norms, and singular
+    # values differ in sum by no more than that (Mirsky 1960).
+    missing = (
+        math.sqrt(observe.trace * control.residual)
+        + math.sqrt(control.trace * observe.residual)
+        + math.sqrt(control.residual * observe.residual)
+    )
+    signature = real_form(system).signature
+    return Gramians(control.factor, signature[:, None] * observe.factor, missing, system.is_symmetric)
+
+
+def gramian_factor(
+    system: PoleResidueSystem, rows: NDArray[np.complex128], tolerance: float = GRAMIAN_TOLERANCE
+) -> GramianFactor:
     """Factor of P, A P + P A^T + B B^T = 0, until the trace of the rest is below tolerance times that of P.
+
+    rows  (n_poles, k), complex, the rows of B
 
     Pivoted Cholesky of the Cauchy-form Gramian P_kl = -b_k b_l^* / (lambda_k + conj(lambda_l)). Its Schur complements
     keep that form, with b multiplied by a Blaschke factor (Gohberg, Kailath, Olshevsky 1995), so a column costs
-    O(n_states n_inputs) instead of O(n_states rank) and the factor keeps its relative accuracy however small the
+    O(n_states k) instead of O(n_states rank) and the factor keeps its relative accuracy however small the
     tolerance. It is low-rank ADI with the pivot's pole as shift and its row of b as tangential direction.
 
     Raises ValueError unless every pole lies in the open left half plane.
     """
-    return _cauchy_factor(system, system.b, tolerance)
-
-
-def observability_factor(system: PoleResidueSystem, tolerance: float) -> GramianFactor:
-    """Factor of Q, A^T Q + Q A + C^T C = 0, as `controllability_factor`."""
-    signature = real_form(system).signature
-    dual = _cauchy_factor(system, np.ascontiguousarray(system.c.T), tolerance)
-    return GramianFactor(signature[:, None] * dual.factor, dual.trace, dual.residual)
-
-
-def gramians(system: PoleResidueSystem, tolerance: float = GRAMIAN_TOLERANCE) -> Gramians:
-    """Both factors; of a symmetric system (C = B^T, Q = S P S with the signature S) the second comes with the first."""
-    control = controllability_factor(system, tolerance)
-    if system.is_symmetric:
-        observe = GramianFactor(
-            real_form(system).signature[:, None] * control.factor, control.trace, control.residual
+    if not system.spectral_abscissa < 0:
+        raise ValueError(
+            f"the spectral abscissa is {system.spectral_abscissa:.3g} 1/s: Gramians exist for poles in the open left "
+            "half plane only"
         )
-    else:
-        observe = observability_factor(system, tolerance)
-    missing = _missing_in_sum((control.trace, control.residual), (observe.trace, observe.residual))
-    return Gramians(control.factor, observe.factor, missing, system.is_symmetric)
+    is_pair = system.is_pair
+    generator = np.where(is_pair[:, None], rows, rows.real + rows.imag)
+    generator = np.ascontiguousarray(generator, dtype=np.complex128)
+    poles = np.ascontiguousarray(system.poles)
+    diagonal = np.sum(np.abs(generator) ** 2, axis=1) / (-2 * poles.real) * np.where(is_pair, 2, 1)
+    trace = residual = float(np.sum(diagonal))
+    start = _first_state(system)
+    blocks = [np.zeros((0, system.n_states))]
+    while residual > tolerance * trace and sum(map(len, blocks)) < system.n_states:
+        columns = np.zeros((256, system.n_states))
+        n_columns, residual = _eliminate(
+            poles, is_pair, start, generator, diagonal, tolerance * trace, columns
+        )
+        if n_columns == 0:
+            break
+        blocks.append(columns[:n_columns])
+    return GramianFactor(np.concatenate(blocks).T, trace, residual)
 
 
 def band_controllability_factor(
@@ -148,21 +168,19 @@ def band_controllability_factor(
 
     band  (low, high), rad/s, 0 <= low < high
 
-    P = 1/(2 pi) times the integral over |omega| in the band of (j omega - A)^-1 B B^* (j omega - A)^-*, by
-    `band_quadrature`; +-omega together give the real and the imaginary part of a column (Gawronski & Juang 1990).
+    P is 1/(2 pi) times the integral over |omega| in the band of (j omega - A)^-1 B B^* (j omega - A)^-* (Gawronski & Juang
+    1990), by `band_quadrature`. omega and -omega together give the real and the imaginary part of a column.
     """
     omega, weight = band_quadrature(band, system.poles, n_frequencies)
     n, m = system.n_states, system.n_inputs
     form = real_form(system)
     columns = np.empty((n, len(omega), 2, m))
     for i, (w, scale) in enumerate(zip(omega, np.sqrt(weight / np.pi), strict=True)):
-        # (jw - A) x = B on each block [[a, -r], [r, a]]: x = ((jw - a) b + r' b[partner]) / ((jw - a)² + r²)
+        # (jw - A) x = b on each block, A x = a x + r x[partner]: x = ((jw - a) b + r b[partner]) / ((jw - a)² + r²)
         shift = 1j * w - form.decay
         x = (shift[:, None] * form.b + form.rotation[:, None] * form.b[form.partner]) * (
             scale / (shift**2 + form.rotation**2)
         )[:, None]
-        single = form.partner == np.arange(n)
-        x[single] = form.b[single] * (scale / shift[single])[:, None]
         columns[:, i, 0], columns[:, i, 1] = x.real, x.imag
     return columns.reshape(n, 2 * m * len(omega))
 
@@ -173,23 +191,17 @@ def band_quadrature(
     """Points (rad/s) and weights of composite Gauss-Legendre quadrature over the band.
 
     poles     (n,), 1/s, of the integrand
-    n_points  about so many, and those of the narrow resonances
+    n_points  approximate number of points, without those of the narrow resonances
 
-    Panels of 4 points are even in log(omega) above a tenth of the smallest |pole|, where the integrand varies over
-    octaves; below, where it is nearly constant, one panel goes down to the band's start. Around a resonance narrower than
-    a panel they are cut into ones that grow in proportion to the distance from it.
+    Panels have 4 points. Above a tenth of the smallest |pole|, where the integrand varies over octaves, they are even in
+    log(omega). Below it the integrand is nearly constant, and one panel reaches to the start of the band. Around a
+    resonance narrower than a panel, panels grow in proportion to the distance from it.
     """
     low, high = band
-    slowest = float(np.min(np.abs(poles), initial=high))
-    knee = min(max(low, slowest / 10), high)
-    n_panels = max(1, n_points // 4)
-    edges: Array = np.array([low])
-    if knee > low:
-        edges = np.append(edges, knee)
-        n_panels = max(1, n_panels - 1)
-    if high > knee:
-        edges = np.append(edges, knee * (high / knee) ** (np.arange(1, n_panels + 1) / n_panels))
-    edges = np.unique(np.concatenate([edges, _edges_around_resonances(band, poles)]))
+    knee = min(max(low, float(np.min(np.abs(poles), initial=high)) / 10), high)
+    n_panels = max(1, n_points // 4 - 1)
+    panels = knee * (high / knee) ** (np.arange(n_panels + 1) / n_panels)
+    edges = np.unique(np.concatenate([[low], panels, _edges_around_resonances(band, poles)]))
     x, w = np.polynomial.legendre.leggauss(4)
     half = np.diff(edges) / 2
     middle = (edges[1:] + edges[:-1]) / 2
@@ -197,7 +209,7 @@ def band_quadrature(
 
 
 def _edges_around_resonances(band: tuple[float, float], poles: NDArray[np.complex128]) -> Array:
-    """(k,), rad/s, inside the band: Im p + |Re p| (0, +-2, +-10, +-50, ...), as far as Im p / 10, for narrow ones."""
+    """(k,), rad/s, inside the band: Im p + |Re p| (0, +-2, +-10, +-50, ...) up to Im p / 10 away, for narrow resonances."""
     low, high = band
     narrow = poles[
         (poles.imag > low / 1.1) & (poles.imag < high * 1.1) & (-poles.real < _NARROW * poles.imag)
@@ -207,16 +219,6 @@ def _edges_around_resonances(band: tuple[float, float], poles: NDArray[np.comple
     offsets = -narrow.real[:, None] * np.concatenate([-steps, [0.0], steps])
     edges = narrow.imag[:, None] + offsets
     return np.asarray(edges[(np.abs(offsets) <= narrow.imag[:, None] / 10) & (edges > low) & (edges < high)])
-
-
-def _missing_in_sum(control: tuple[float, float], observe: tuple[float, float]) -> float:
-    """How far in sum the singular values of factors can be from the whole's, from (trace, trace left out) of each Gramian.
-
-    With P = L L^T + R and Q likewise, the factors of the whole have more blocks, whose nuclear norms are at most the
-    products of Frobenius norms, and singular values differ in sum by no more than that (Mirsky 1960).
-    """
-    (p, p_rest), (q, q_rest) = control, observe
-    return math.sqrt(q * p_rest) + math.sqrt(p * q_rest) + math.sqrt(p_rest * q_rest)
 
 
 def _first_state(system: PoleResidueSystem) -> NDArray[np.intp]:
@@ -233,37 +235,6 @@ def _in_real_coordinates(system: PoleResidueSystem, rows: NDArray[np.complex128]
     out[start[is_pair]] = np.sqrt(2) * rows.real[is_pair]
     out[start[is_pair] + 1] = np.sqrt(2) * rows.imag[is_pair]
     return out
-
-
-def _cauchy_factor(
-    system: PoleResidueSystem, rows: NDArray[np.complex128], tolerance: float
-) -> GramianFactor:
-    if not system.spectral_abscissa < 0:
-        raise ValueError(
-            f"the spectral abscissa is {system.spectral_abscissa:.3g} 1/s: Gramians exist for poles in the open left "
-            "half plane only"
-        )
-    is_pair = system.is_pair
-    generator = np.where(is_pair[:, None], rows, rows.real + rows.imag)
-    generator = np.ascontiguousarray(generator, dtype=np.complex128)
-    poles = np.ascontiguousarray(system.poles)
-    diagonal = np.sum(np.abs(generator) ** 2, axis=1) / (-2 * poles.real) * np.where(is_pair, 2, 1)
-    trace = float(np.sum(diagonal))
-    start = _first_state(system)
-    blocks: list[Array] = []
-    residual = trace
-    rank = 0
-    while residual > tolerance * trace and rank < system.n_states:
-        columns = np.zeros((256, system.n_states))
-        n_columns, residual = _eliminate(
-            poles, is_pair, start, generator, diagonal, tolerance * trace, columns
-        )
-        blocks.append(columns[:n_columns])
-        rank += n_columns
-        if n_columns == 0:
-            break
-    factor = np.concatenate(blocks).T if blocks else np.zeros((system.n_states, 0))
-    return GramianFactor(factor, trace, residual)
 
 
 @njit(cache=True)

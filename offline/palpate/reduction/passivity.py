@@ -1,6 +1,6 @@
 """How much energy a discrete force response can give out over closed pokes.
 
-A poke u_k = Re(a e^{j theta k}), theta = omega T, returns to where it began after 2 pi / theta samples. A device that
+A poke u_k = Re(a e^{j theta k}), theta = omega T, is back at its start after 2 pi / theta samples. A device that
 renders the force samples does the work of the trapezoidal sum of (F_k + F_{k+1})/2 . (u_{k+1} - u_k) on the tissue. With
 F_k = Re(G a e^{j theta k}) the mean of one summand is 1/4 Re[(G a)^H a (1 + e^{-j theta})(e^{j theta} - 1)], and as the
 product of the brackets is 2j sin(theta), the work of one closed poke is
@@ -14,6 +14,7 @@ sin(theta)/theta is positive below the Nyquist frequency.
 from __future__ import annotations
 
 import numpy as np
+import scipy.optimize
 from numpy.typing import NDArray
 
 from palpate.lti.frequencies import maximum, spectral_norms
@@ -21,8 +22,8 @@ from palpate.lti.pole_residue import PoleResidueSystem
 
 Array = NDArray[np.float64]
 
-
 _NEGLIGIBLE = 1e-3
+"""Dissipation below zero that does not count, over the static stiffness."""
 
 
 def passivity_margin(discrete: PoleResidueSystem) -> float:
@@ -36,30 +37,27 @@ def passivity_margin(discrete: PoleResidueSystem) -> float:
 
 
 def passive_up_to(discrete: PoleResidueSystem) -> float:
-    """Angle a sample, 0..pi, below which no sinusoidal poke gets energy out; pi where none does at any.
+    """Angle per sample, 0..pi, below which no sinusoidal poke gets energy out; pi where none does at any angle.
 
-    What stays below a thousandth of the static stiffness does not count: a reduction that is not exactly symmetric
-    gives that much to a slow circular poke.
+    Less than a thousandth of the static stiffness does not count: a reduction that is not exactly symmetric gives that
+    much to a slow circular poke.
     """
     theta = _angles(discrete)
     static = float(spectral_norms(discrete.transfer(np.ones(1, dtype=np.complex128)))[0])
     active = np.flatnonzero(_least_dissipation(discrete, theta) < -_NEGLIGIBLE * static)
     if not len(active):
         return float(np.pi)
-    # Where it begins lies between this sample and the one before: bisect.
-    high = theta[active[0]]
-    low = theta[active[0] - 1] if active[0] else 0.0
-    for _ in range(40):
-        middle = (low + high) / 2
-        if _least_dissipation(discrete, np.array([middle]))[0] < -_NEGLIGIBLE * static:
-            high = middle
-        else:
-            low = middle
-    return float(low)
+    if active[0] == 0:
+        return 0.0
+
+    def excess(angle: float) -> float:
+        return float(_least_dissipation(discrete, np.array([angle]))[0]) + _NEGLIGIBLE * static
+
+    return float(scipy.optimize.brentq(excess, theta[active[0] - 1], theta[active[0]]))
 
 
 def largest_energy_out(discrete: PoleResidueSystem, amplitude_m: float) -> float:
-    """Largest work, J, that one closed sinusoidal poke of |a| = amplitude_m gets out; 0 where none does."""
+    """Largest work, J, that one closed sinusoidal poke of |a| = amplitude_m gets out; 0 where no poke gets any."""
 
     def energy(theta: Array) -> Array:
         return -np.pi * np.sinc(theta / np.pi) * _least_dissipation(discrete, theta)

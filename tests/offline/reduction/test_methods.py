@@ -16,8 +16,8 @@ from palpate.reduction.accuracy import hinf_error, in_band_error
 from palpate.reduction.gramians import (
     band_controllability_factor,
     band_quadrature,
-    controllability_factor,
-    observability_factor,
+    gramian_factor,
+    gramians,
     real_form,
 )
 from palpate.scene.material import PronySeries
@@ -79,14 +79,12 @@ def test_gramian_factors_solve_their_lyapunov_equations(case):
     a, b, c, _ = dense(system)
     control_gramian = scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)
     observe_gramian = scipy.linalg.solve_continuous_lyapunov(a.T, -c.T @ c)
-    for exact, factor in (
-        (control_gramian, controllability_factor(system, 1e-20)),
-        (observe_gramian, observability_factor(system, 1e-20)),
-    ):
-        product = factor.factor @ factor.factor.T
-        assert np.linalg.norm(product - exact) < 1e-10 * np.linalg.norm(exact)
-        assert factor.trace == pytest.approx(np.trace(exact), rel=1e-10)
-        assert factor.residual <= 1e-20 * factor.trace
+    found = gramians(system)
+    for exact, factor in ((control_gramian, found.control), (observe_gramian, found.observe)):
+        assert np.linalg.norm(factor @ factor.T - exact) < 1e-10 * np.linalg.norm(exact)
+    control = gramian_factor(system, system.b)
+    assert control.trace == pytest.approx(np.trace(control_gramian), rel=1e-10)
+    assert control.residual <= 1e-20 * control.trace
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-5, 1e-8])
@@ -94,7 +92,7 @@ def test_what_a_truncated_gramian_factor_misses_is_positive_and_has_the_stated_t
     system = body(5, n_modes=20)
     a, b, _, _ = dense(system)
     exact = scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)
-    found = controllability_factor(system, tolerance)
+    found = gramian_factor(system, system.b, tolerance)
     rest = exact - found.factor @ found.factor.T
     noise = 1e-11 * found.trace
     assert np.trace(rest) == pytest.approx(found.residual, abs=noise)
@@ -232,7 +230,7 @@ def test_band_limited_truncation_spends_its_order_in_the_band(case):
 def test_doubling_the_quadrature_of_the_band_leaves_the_singular_values_that_count():
     system = body(7, n_modes=30)
     band = (0.0, 2 * np.pi * BAND_HZ[1])
-    observe = observability_factor(system, 1e-20).factor
+    observe = gramians(system).observe
     sigma = [
         np.linalg.svd(observe.T @ band_controllability_factor(system, band, n), compute_uv=False)
         for n in (120, 240)
@@ -302,7 +300,7 @@ def test_an_unstable_body_is_refused_with_its_spectral_abscissa():
         with pytest.raises(ReductionError, match=r"1 of its .* spectral abscissa 0\.125 1/s"):
             reduce(unstable, method, order=4)
     with pytest.raises(ValueError, match="spectral abscissa"):
-        controllability_factor(unstable, 1e-10)
+        gramian_factor(unstable, unstable.b)
 
 
 @pytest.mark.parametrize(
