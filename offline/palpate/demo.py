@@ -85,7 +85,7 @@ def run_demo(config_path: Path, out: Path, seconds: float, progress: Progress) -
     progress("picture")
     touch = read_touch(recording, model)
     picture = out / "demo.png"
-    draw_touch(model, touch, 0, picture)
+    draw_touch(model, touch, picture)
     difference = touch.force_n - touch.force_full_n
     largest = np.linalg.norm(touch.force_full_n, axis=1).max()
     error, in_band = (
@@ -112,18 +112,18 @@ def read_touch(recording: Path, model: ReducedModel) -> Touch:
             raise ValueError(f"{recording}: no column {missing[0]!r}, expected a recording of {model.name}")
         return np.array([[float(row[n]) for n in names] for row in rows])
 
-    heard = np.array([int(row["tick"]) for row in rows])
+    received = np.array([int(row["tick"]) for row in rows])
     scale = np.repeat(
         [[float(row[f"{c.name}.force_scale"]) for c in model.contacts] for row in rows], 3, axis=1
     )
     start = np.concatenate([contact.center_m for contact in model.contacts])
     applied, force = columns("position", "m") - start, columns("force", "n")
-    # Force messages are best effort: the displacement of a tick that was not heard is interpolated.
-    ticks = np.arange(heard[0], heard[-1] + 1)
-    every = np.stack([np.interp(ticks, heard, channel) for channel in applied.T], axis=1)
-    exact = model.full.response(every, model.period_s)[heard - heard[0]]
+    # Force messages may be lost: the displacement of such a tick is interpolated.
+    ticks = np.arange(received[0], received[-1] + 1)
+    every = np.stack([np.interp(ticks, received, channel) for channel in applied.T], axis=1)
+    exact = model.full.response(every, model.period_s)[received - received[0]]
     # The model's force is what the tip does to the tissue, the device's is its negative.
-    return Touch((heard - heard[0]) * model.period_s, applied, force, -scale * exact)
+    return Touch((received - received[0]) * model.period_s, applied, force, -scale * exact)
 
 
 def _built(path: Path, config_path: Path, progress: Progress) -> ReducedModel:

@@ -7,7 +7,7 @@ import stat
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import BinaryIO, TypeGuard
+from typing import TypeGuard
 
 LONGEST_NAME_BYTES = 255  # on the usual file systems
 
@@ -82,16 +82,6 @@ def write_atomically(path: Path, data: bytes, inputs: Iterable[Path] = ()) -> No
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
-
-
-def create_new(path: Path) -> BinaryIO:
-    """A new file, open for writing. Raises OSError, in one line, if the name is taken or can't be created."""
-    try:
-        return path.open("xb")
-    except FileExistsError:
-        raise OSError(f"{printable(path)} exists: expected the name of a new file") from None
-    except OSError as error:
-        raise OSError(f"{printable(path)}: could not be created: {error.strerror}") from error
 
 
 def _kind(path: Path) -> str:

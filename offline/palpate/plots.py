@@ -51,30 +51,27 @@ def require_matplotlib() -> None:
         raise ValueError("pictures need matplotlib: pip install 'palpate[plots]'")
 
 
-def draw_touch(model: ReducedModel, touch: Touch, contact: int, path: Path) -> None:
-    """The body at the deepest point of the poke, and tip displacement, force and error over time.
+def write_picture(figure: Any, path: Path, dpi: int = 110) -> None:
+    """Write a matplotlib figure as PNG; the folder must exist. Raises OSError."""
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=dpi)
+    write_atomically(path, picture.getvalue())
 
-    contact  index of the contact patch that was poked
-    path     picture to write; its folder must exist
-    """
-    require_matplotlib()
-    import matplotlib as mpl
 
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
+def draw_touch(model: ReducedModel, touch: Touch, path: Path) -> None:
+    """The body at the deepest poke of its first contact, and tip displacement, force and error over time."""
+    from matplotlib.figure import Figure
 
-    along = slice(3 * contact, 3 * contact + 3)
-    inward = -np.asarray(model.contacts[contact].normal)
-    depth = touch.displacement_m[:, along] @ inward
-    served, full = touch.force_n[:, along] @ -inward, touch.force_full_n[:, along] @ -inward
+    inward = -np.asarray(model.contacts[0].normal)
+    depth = touch.displacement_m[:, :3] @ inward
+    served, full = touch.force_n[:, :3] @ -inward, touch.force_full_n[:, :3] @ -inward
     largest = float(np.max(np.linalg.norm(touch.force_full_n, axis=1)))
     deepest = int(np.argmax(np.abs(depth)))
 
-    figure = plt.figure(figsize=(13.5, 7.2), layout="constrained")
+    figure = Figure(figsize=(13.5, 7.2), layout="constrained")
     halves: Any = figure.subfigures(1, 2, width_ratios=[1.0, 1.15])
     left, right = halves
-    surface = surface_displacement(model, touch.displacement_m[: deepest + 1])
-    _draw_body(left, model, contact, surface)
+    _draw_body(left, model, surface_displacement(model, touch.displacement_m[: deepest + 1]))
 
     axes = right.subplots(3, 1, sharex=True)
     axes[0].plot(touch.time_s, 1e3 * depth, color="tab:green")
@@ -108,10 +105,7 @@ def draw_touch(model: ReducedModel, touch: Touch, contact: int, path: Path) -> N
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
     right.suptitle("What the client felt through the 1 kHz server")
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=110)
-    write_atomically(path, picture.getvalue())
-    plt.close(figure)
+    write_picture(figure, path)
 
 
 def surface_displacement(model: ReducedModel, displacement_m: Array) -> Array:
@@ -121,40 +115,41 @@ def surface_displacement(model: ReducedModel, displacement_m: Array) -> Array:
     return np.asarray(moved, dtype=float).reshape(-1, 3)
 
 
-def _draw_body(figure: Any, model: ReducedModel, contact: int, displacement: Array) -> None:
-    """The deformed surface, colored by how far it moved, seen from above the contact."""
+def _draw_body(figure: Any, model: ReducedModel, displacement: Array) -> None:
+    """The deformed surface, colored by how far it moved, seen from above the first contact."""
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LogNorm
+    from matplotlib.colors import LightSource, LogNorm
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    patch = model.contacts[contact]
-    vertices = 1e3 * (model.surface.vertices + displacement)
-    corners = vertices[model.surface.triangles]
-    moved = 1e3 * np.linalg.norm(displacement, axis=1)
-    per_triangle = moved[model.surface.triangles].mean(axis=1)
-    top = max(float(moved.max()), 1e-9)
-    norm = LogNorm(vmin=0.02 * top, vmax=top, clip=True)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    facing = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
+    patch = model.contacts[0]
     normal = np.asarray(patch.normal)
-    light = normal + np.array([0.3, -0.2, 0.5])
-    shade = 0.45 + 0.55 * np.clip(facing @ (light / np.linalg.norm(light)), 0, 1)
-    mapper = ScalarMappable(norm=norm, cmap="magma")
-    colors = mapper.to_rgba(per_triangle)
-    colors[:, :3] *= shade[:, None]
+    elevation = float(np.degrees(np.arcsin(np.clip(normal[2], -1, 1))))
+    azimuth = float(np.degrees(np.arctan2(normal[1], normal[0])))
+    vertices = 1e3 * (model.surface.vertices + displacement)
+    moved = 1e3 * np.linalg.norm(displacement, axis=1)
+    top = max(float(moved.max()), 1e-9)
+    mapper = ScalarMappable(norm=LogNorm(vmin=0.02 * top, vmax=top, clip=True), cmap="magma")
+    colors = mapper.to_rgba(moved[model.surface.triangles].mean(axis=1))
 
     axis = figure.add_subplot(projection="3d")
-    axis.add_collection3d(Poly3DCollection(corners, facecolors=colors, edgecolors=colors, linewidths=0.3))
+    light = LightSource(azdeg=60 - azimuth, altdeg=min(elevation + 20, 90))
+    axis.add_collection3d(
+        Poly3DCollection(
+            vertices[model.surface.triangles],
+            facecolors=colors,
+            edgecolors=colors,
+            linewidths=0.3,
+            shade=True,
+            lightsource=light,
+        )
+    )
     tip = 1e3 * np.asarray(patch.center_m)
     shaft = np.stack([tip, tip + 45 * normal])
     axis.plot(*shaft.T, color="tab:cyan", linewidth=3, zorder=10)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    for setter, a, b in zip((axis.set_xlim, axis.set_ylim, axis.set_zlim), low, high, strict=True):
-        setter(a, b)
+    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axis.set_box_aspect(high - low, zoom=1.3)
-    elevation = np.degrees(np.arcsin(np.clip(normal[2], -1, 1)))
-    azimuth = np.degrees(np.arctan2(normal[1], normal[0]))
-    axis.view_init(elev=float(np.clip(elevation - 25, -60, 60)), azim=float(azimuth) + 35)
+    axis.view_init(elev=float(np.clip(elevation - 25, -60, 60)), azim=azimuth + 35)
     axis.set_axis_off()
     size = " x ".join(f"{extent:.0f}" for extent in high - low)
     axis.set_title(f"{model.name}, {size} mm, at the deepest point of the poke\ntool at '{patch.name}'")

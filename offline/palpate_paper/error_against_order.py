@@ -19,7 +19,7 @@ import numpy as np
 from palpate.build import FullModel, build_full_model
 from palpate.files import write_atomically
 from palpate.lti.frequencies import all_frequencies, band_frequencies, spectral_norms
-from palpate.plots import require_matplotlib
+from palpate.plots import require_matplotlib, write_picture
 from palpate.reduction.methods import METHODS, reductions
 from palpate.scene.schema import load_config
 
@@ -91,10 +91,7 @@ def write_table(rows: Sequence[Row], path: Path) -> None:
 def draw(rows: Sequence[Row], title: str, band_hz: tuple[float, float], path: Path) -> None:
     """Three panels: error in the haptic band, at 0 Hz, and over all frequencies."""
     require_matplotlib()
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     panels = (
         ("error_in_band", f"force error in {band_hz[0]:g}-{band_hz[1]:g} Hz"),
@@ -102,7 +99,8 @@ def draw(rows: Sequence[Row], title: str, band_hz: tuple[float, float], path: Pa
         ("error_hinf", "H-infinity error over the largest response"),
     )
     styles = {"tbr": "o-", "tbr-band": "s-", "hankel-optimal": "d-.", "modal": "^--", "modal-static": "v--"}
-    figure, axes = plt.subplots(1, 3, figsize=(14, 4.6), layout="constrained")
+    figure = Figure(figsize=(14, 4.6), layout="constrained")
+    axes = figure.subplots(1, 3)
     for axis, (field, label) in zip(axes, panels, strict=True):
         for method in METHODS:
             chosen = [r for r in rows if r.method == method]
@@ -119,10 +117,7 @@ def draw(rows: Sequence[Row], title: str, band_hz: tuple[float, float], path: Pa
     axes[0].set_ylabel("relative error")
     axes[0].legend(frameon=False)
     figure.suptitle(title)
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=110)
-    write_atomically(path, picture.getvalue())
-    plt.close(figure)
+    write_picture(figure, path)
 
 
 def main() -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from palpate.files import write_atomically
-from palpate.plots import require_matplotlib
 
 Cell = str | float | int
 
@@ -49,17 +48,12 @@ class Figure:
         writer.writerow(self.columns)
         writer.writerows([_text(cell) for cell in row] for row in self.rows)
         write_atomically(folder / f"{self.stem}.csv", table.getvalue().encode())
-        require_matplotlib()
-        import matplotlib as mpl
+        from matplotlib.figure import Figure as Canvas
 
-        mpl.use("Agg")
-        import matplotlib.pyplot as plt
-
-        canvas = plt.figure(figsize=self.size, layout="constrained")
+        canvas = Canvas(figsize=self.size, layout="constrained")
         self.draw(canvas)
         picture = io.BytesIO()
         canvas.savefig(picture, format="png", dpi=95)
-        plt.close(canvas)
         write_atomically(folder / f"{self.stem}.png", _with_palette(picture))
 
 

@@ -117,7 +117,8 @@ def test_method_and_order_can_be_chosen_on_the_command_line(slab: tuple[Path, st
     [
         (["build", "none.toml"], "none.toml: no such configuration"),
         (["build", "slab.toml", "--order", "1"], "reduction.order = 1"),
-        (["build", "slab.toml", "--tolerance", "200%"], "'200%'"),
+        (["build", "slab.toml", "--tolerance", "200%"], "reduction.tolerance = 2.0: expected below 1"),
+        (["build", "slab.toml", "--tolerance", "much"], "--tolerance 'much': expected a fraction"),
         (["build", "slab.toml", "--tolerance", "2%", "--order", "20"], "not allowed with argument"),
         (["build", "slab.toml", "--method", "pod"], "reduction.method = 'pod'"),
         (
