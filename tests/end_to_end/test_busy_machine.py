@@ -89,7 +89,7 @@ def _keeps_its_clients(start: Callable[..., Any], folder: Path, seconds: float) 
 
 
 def test_no_client_loses_the_server_beside_busy_loops(start: Callable[..., Any], tmp_path: Path) -> None:
-    _keeps_its_clients(start, tmp_path, 8.0)
+    _keeps_its_clients(start, tmp_path, 4.0)
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from palpate.discretization import conservative
 from palpate.scene.schema import load_config
@@ -14,6 +15,7 @@ from palpate_paper.static_stiffness import static_stiffness
 LIVER = Path(__file__).parents[2] / "configs" / "liver.toml"
 
 
+@pytest.mark.slow
 def test_the_patch_is_several_nodes_across_and_the_tip_no_stiffer_than_a_bonded_punch_on_rigid_ground() -> (
     None
 ):

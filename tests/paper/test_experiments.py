@@ -158,6 +158,7 @@ def test_deflections_on_lattices_converge_at_second_order_but_for_linear_colloca
     assert stuck[-1] > stuck[-2] > stuck[-3]
 
 
+@pytest.mark.slow
 def test_on_scattered_nodes_the_conservative_deflections_converge_and_linear_collocation_does_not() -> None:
     errors = convergence.scattered_square_errors([square_membrane(n * n) for n in (9, 27)], 4)
 
@@ -170,6 +171,7 @@ def test_on_scattered_nodes_the_conservative_deflections_converge_and_linear_col
     assert order("collocation, linear") < 0.5
 
 
+@pytest.mark.slow
 def test_the_cubes_displacement_converges_to_quadratic_hexahedra() -> None:
     # Where the held bottom meets free sides the displacement grows like r^lambda with 1/2 < lambda < 1 (0.71 for
     # nu = 0.3 in plane strain, Williams 1952). That leaves linear elements the L2 order 2 lambda, above one: half the

@@ -166,13 +166,17 @@ def test_cube_frequencies_are_within_four_percent_at_nine_nodes_an_edge_and_impr
     assert np.linalg.norm(fine) < np.linalg.norm(medium) < np.linalg.norm(coarse)
 
 
-def test_a_free_ball_has_six_rigid_modes_and_lambs_frequencies_and_improves_with_refinement():
-    coarse, fine = _ball_frequencies(0.22), _ball_frequencies(0.16)
-    for frequencies in (coarse, fine):
-        assert frequencies[5] < 1e-4 < frequencies[6]
-    errors = [np.abs(f[6:] / LAMB - 1) for f in (coarse, fine)]
-    assert errors[1].max() < 0.04
-    assert errors[1].max() < errors[0].max()
+def test_a_free_ball_has_six_rigid_modes_and_lambs_frequencies():
+    frequencies = _ball_frequencies(0.22)
+    assert frequencies[5] < 1e-4 < frequencies[6]
+    np.testing.assert_allclose(frequencies[6:], LAMB, rtol=0.05)
+
+
+@pytest.mark.slow
+def test_a_free_balls_frequencies_improve_with_refinement():
+    coarse, fine = (np.abs(_ball_frequencies(spacing)[6:] / LAMB - 1).max() for spacing in (0.22, 0.16))
+    assert fine < 0.04
+    assert fine < coarse
 
 
 def test_modes_are_mass_normalized_and_diagonalize_the_stiffness():

@@ -35,6 +35,7 @@ def static_error(full, reduced):
     return in_band_error(full, reduced, np.zeros(1))
 
 
+@pytest.mark.slow
 def test_balanced_truncation_of_the_cube_with_a_thousand_nodes_is_below_one_percent_at_order_200():
     _, full = cube(10, conservative)
     assert full.n_states == 8067
