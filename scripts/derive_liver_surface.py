@@ -49,7 +49,7 @@ def main() -> None:
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_bytes(mesh.export(file_type="ply", encoding="binary", vertex_normal=False))
 
-    surface = load_surface(arguments.output)  # refuses it if the decimation spoilt it
+    surface = load_surface(arguments.output)  # raises if the decimation damaged it
     rind = np.argwhere(mask & ~ndimage.binary_erosion(mask))
     distance = np.abs(depth_inside((rind + 0.5) * voxel_m - origin, surface)) * 1e3
     size = np.ptp(surface.vertices, axis=0) * 1e3

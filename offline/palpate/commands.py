@@ -38,9 +38,7 @@ def build() -> None:
         from palpate.scene.schema import load_config, override_reduction
 
     tolerance = None if options.tolerance is None else parse_tolerance(options.tolerance)
-    scene = override_reduction(
-        load_config(options.scene), options.method, options.order, tolerance, "command line"
-    )
+    scene = override_reduction(load_config(options.scene), options.method, options.order, tolerance)
     path = options.output or Path(f"{scene.name}.npz")
     inputs = [options.scene]
     if surface := getattr(scene.geometry, "file", None):

@@ -1,4 +1,4 @@
-"""The first ten minutes in one command: build the liver, serve it in a second process, poke it, draw what was felt."""
+"""The demonstration: builds a scene, serves it in a second process, pokes it, and draws the forces."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _CLIENT_TIMEOUT_S = 60.0
 
 @dataclass(frozen=True)
 class Demo:
-    """What a demonstration leaves behind.
+    """Results of a demonstration.
 
     client        the headless client's summary, as it prints it with --json
     touch         the recorded poke beside the full model's answer
@@ -46,13 +46,12 @@ class Demo:
     def lines(self) -> list[str]:
         """The summary of latency and force, for a person."""
         trip = self.client["round_trip_s"]
-        times = ", ".join(f"{name} {1e6 * trip[key]:.0f}" for name, key in (("p50", "p50"), ("p99", "p99")))
         inward = -np.asarray(self.model.contacts[0].normal)
         force = self.touch.force_n[:, :3] @ -inward
         depth = self.touch.displacement_m[:, :3] @ inward
         return [
             f"commands      {self.client['commands_sent']:,} sent, {self.client['commands_answered']:,} answered",
-            f"round trip    {times} microseconds, command to force, over the wire",
+            f"round trip    p50 {1e6 * trip['p50']:.0f}, p99 {1e6 * trip['p99']:.0f} microseconds, command to force, over the wire",
             f"depth         up to {1e3 * depth.max():.2f} mm",
             f"force         {force.min():+.3f} to {force.max():+.3f} N along the outward normal: positive pushes the device out",
             f"full model    served and exact force differ by at most {100 * self.error_in_band:.2g} % of the largest "
@@ -65,7 +64,7 @@ class Demo:
 
 
 def run_demo(config_path: Path, out: Path, seconds: float, progress: Progress) -> Demo:
-    """Build (unless `out` holds a model of the very same configuration), serve, poke for `seconds`, draw.
+    """Build (unless `out` holds a model of the same configuration), serve, poke for `seconds`, draw.
 
     Raises what `build_model` raises, and ValueError when server or client fail, with what they said.
     """
@@ -96,7 +95,7 @@ def run_demo(config_path: Path, out: Path, seconds: float, progress: Progress) -
 
 
 def read_touch(recording: Path, model: ReducedModel) -> Touch:
-    """A recording of the headless client beside what a device would render with the full model, for the same positions.
+    """A recording of the headless client beside what a device would render with the full model for the same positions.
 
     Raises ValueError where it lacks a column or a contact, or no tick was recorded.
     """

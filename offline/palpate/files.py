@@ -1,4 +1,4 @@
-"""Names that are safe to show and to open, and files that are written as a whole or not at all."""
+"""Names that are safe to show and to open, and atomic writing of files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def printable(text: object, longest: int | None = None) -> str:
 
 
 def is_plain_name(name: object) -> TypeGuard[str]:
-    """True for the name of a file that lies directly in the folder where it is looked up, and that is safe to show."""
+    """True for a name without a folder that is safe to show."""
     return (
         isinstance(name, str)
         and name not in ("", ".", "..")
@@ -85,7 +85,7 @@ def write_atomically(path: Path, data: bytes, inputs: Iterable[Path] = ()) -> No
 
 
 def _kind(path: Path) -> str:
-    """What lies at `path`, links not followed; empty if nothing does."""
+    """The kind of file at `path`, links not followed; empty if there is none."""
     try:
         mode = path.lstat().st_mode
     except (FileNotFoundError, NotADirectoryError):

@@ -1,7 +1,7 @@
 """Ctrl-C: one line and exit code 130, also while libraries are imported.
 
-Some libraries catch every exception around their own imports, KeyboardInterrupt among them, and go on. So by default the
-process ends inside the signal handler. Only work that leaves something to clean up gets the exception, within `raised`.
+Some libraries catch every exception around their own imports, KeyboardInterrupt among them, and go on. By default the process
+therefore ends inside the signal handler. Work that needs to clean up gets the exception, within `raised`.
 """
 
 import os
@@ -18,7 +18,7 @@ _was_asked = False
 
 
 def install() -> None:
-    """Answer SIGINT from now on, unless it is ignored, as in the background of a script."""
+    """Install the handler of SIGINT, unless the signal is ignored, as in the background of a script."""
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _on_interrupt)
 
@@ -53,13 +53,13 @@ def check() -> None:
 
 
 def leave(code: int) -> None:
-    """Exit with `code`. What libraries do at exit is not interrupted any more: the command has ended."""
+    """Exit with `code`. SIGINT is ignored from here on: the command has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.exit(code)
 
 
 def end() -> int:
-    """Say that the command was interrupted; returns the exit code."""
+    """Print that the command was interrupted; returns the exit code."""
     sys.stdout.flush()
     os.write(2, _LINE)
     return EXIT_INTERRUPTED

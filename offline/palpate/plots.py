@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Touch:
-    """One recorded poke and what the full model answers to it.
+    """One recorded poke and the full model's answer to it.
 
     time_s           (n_ticks,), s
     displacement_m   (n_ticks, n_inputs), applied by the server at each tick
@@ -46,15 +46,15 @@ class Touch:
 
 
 def require_matplotlib() -> None:
-    """Raises ValueError with the way out when matplotlib is not installed."""
+    """Raise ValueError with what to install when matplotlib is missing."""
     if importlib.util.find_spec("matplotlib") is None:
         raise ValueError("pictures need matplotlib: pip install 'palpate[plots]'")
 
 
-def write_picture(figure: Any, path: Path, dpi: int = 110) -> None:
+def write_picture(figure: Any, path: Path) -> None:
     """Write a matplotlib figure as PNG; the folder must exist. Raises OSError."""
     picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=dpi)
+    figure.savefig(picture, format="png", dpi=110)
     write_atomically(path, picture.getvalue())
 
 

@@ -18,7 +18,7 @@ def percent(fraction: float) -> str:
 
 
 def accuracy_text(model: ReducedModel, verbose: bool = False) -> str:
-    """What a person should know before using the model, then a verdict and what to do; `verbose` adds every figure."""
+    """The most important errors of a model, a verdict and advice; `verbose` adds every figure."""
     lines = [f"\n{model.name}: {model.order} states instead of {model.n_states_full:,} ({model.method})"]
     lines += _columns(_first_screen(model))
     lines.append(f"  verdict: {_verdict(model)}")
@@ -31,7 +31,7 @@ def accuracy_text(model: ReducedModel, verbose: bool = False) -> str:
 
 
 def advice(model: ReducedModel) -> list[str]:
-    """What to change, a sentence each, where an error is notable; empty for a good model. Never what is in use."""
+    """What to change where an error is notable, a sentence each; empty for a good model. Never advises the method in use."""
     accuracy, found = model.accuracy, []
     low, high = accuracy.band_hz
     for error, where in (

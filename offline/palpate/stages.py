@@ -11,7 +11,7 @@ from palpate import interrupts
 
 
 class Stages:
-    """Call it with a stage's name when the stage begins; `note` adds what came of it, `warn` tells the user something."""
+    """Call it with a stage's name when the stage begins; `note` adds its result, `warn` prints a warning."""
 
     def __init__(self) -> None:
         self._is_terminal = sys.stdout.isatty()

@@ -1,1 +1,1 @@
-"""Studies that a reader can rerun: what the methods do, as tables and pictures."""
+"""Studies of the methods that a reader can rerun, as tables and pictures."""

@@ -45,7 +45,7 @@ def error_against_order(
 ) -> list[Row]:
     """A row for each method and order; orders that a method does not have are left out.
 
-    All models are sampled at the same frequencies, the full one once: its resonances, and even ones in the logarithm.
+    All models are evaluated at the same frequencies, the full model once: its resonances, and points even in the logarithm.
     """
     system = full.system
     everywhere = all_frequencies((system,))

@@ -168,7 +168,7 @@ def _rankings(example: Example, compared: Sequence[Comparison], full: FullSoluti
 
 
 def _at_equal_order(compared: Sequence[Comparison], n_steps: int) -> str:
-    """The verdict on "modal truncation takes the least time": the time of a state and step, which leaves the order out."""
+    """Whether modal truncation takes the least time per state and step, a time that does not depend on the order."""
     each = {c.method.name: c.stepping_s / (c.reduced.order * n_steps) for c in compared}
     orders = {c.method.name: c.reduced.order for c in compared}
     low, high = min(each.values()), max(each.values())

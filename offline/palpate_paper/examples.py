@@ -37,7 +37,7 @@ CUBE_SINE_HZ = 0.2
 
 @dataclass(frozen=True)
 class Example:
-    """A full model and what is done with it.
+    """A full model and the settings of its study.
 
     name         disc, square or cube
     system       from the tip's displacement, m, to the reaction force, N, one component for membranes, three in space
@@ -145,7 +145,7 @@ def cube(nodes_an_edge: int = 10, discretization: Discretization = "conservative
 
 
 def cube_parts(nodes_an_edge: int) -> tuple[NodeCloud, NDArray[np.intp], NDArray[np.intp]]:
-    """(cloud, fixed nodes, tip nodes) of the unit cube: the tip is what is within 0.6 spacings of the middle of the top."""
+    """(cloud, fixed nodes, tip nodes) of the unit cube: the tip nodes lie within 0.6 spacings of the middle of the top."""
     cloud = box_lattice((0, 0, 0), (1, 1, 1), (nodes_an_edge,) * 3)
     spacing = 1 / (nodes_an_edge - 1)
     away = np.abs(cloud.points[:, :2] - 0.5).max(axis=1)
@@ -175,7 +175,7 @@ def with_drag(modes: ElasticModes, drag_per_s: float) -> PoleResidueSystem:
     Each mode must be underdamped: mu_k real and above c²/4, or complex in conjugate pairs.
     """
     mu = modes.squared_frequencies.astype(np.complex128)
-    kept = mu.imag >= 0  # one of each conjugate pair; its two poles then stand for the pair's four
+    kept = mu.imag >= 0  # one of each conjugate pair: its two poles stand for the four of the pair
     mu = mu[kept]
     b, c = modes.input_coupling[kept].astype(np.complex128), modes.output_coupling[:, kept]
     root = np.sqrt(mu - drag_per_s**2 / 4)

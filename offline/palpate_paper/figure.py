@@ -1,4 +1,4 @@
-"""One regenerated figure: its numbers, how to draw them, and what they say."""
+"""One regenerated figure: its table, its plot and its findings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Cell = str | float | int
 
 @dataclass(frozen=True)
 class Figure:
-    """What a figure of the page is made of.
+    """A figure of the page.
 
     number    2 to 13 as in BaniHani & De 2009; from 14 on, beyond it
     title     one line
@@ -25,7 +25,7 @@ class Figure:
     draw      draws onto an empty matplotlib figure
     findings  what we find and why it differs from the paper, Markdown, computed from the rows
     size      of the plot, inches
-    headline  what to remember of it, one line of Markdown, for the page's summary; empty for none
+    headline  one line of Markdown for the page's summary; may be empty
     """
 
     number: int

@@ -27,7 +27,7 @@ Profile = Callable[[Array, Array], Array]
 
 
 def require_scikit_fem() -> None:
-    """Raises ValueError with the way out when scikit-fem is not installed."""
+    """Raise ValueError with what to install when scikit-fem is missing."""
     if importlib.util.find_spec("skfem") is None:
         raise ValueError("finite elements need scikit-fem: pip install 'palpate[experiments]'")
 

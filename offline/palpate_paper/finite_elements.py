@@ -33,7 +33,7 @@ Where = Callable[[Array], NDArray[np.bool_]]
 
 @dataclass(frozen=True)
 class FiniteElements:
-    """An assembled body, nothing held yet.
+    """Matrices of a body without supports.
 
     places      (n_dofs, dim), m: where each degree of freedom sits
     components  (n_dofs,): 0, 1, 2 for the displacement along x, y, z; 0 for a membrane

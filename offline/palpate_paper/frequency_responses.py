@@ -67,8 +67,8 @@ def frequency_response(study: Study, example: Example, number: int) -> Figure:
 
 
 def frequencies_hz(example: Example) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Even ones in the logarithm from a tenth of the first resonance to three times the last, and the resonances that
-    the tip sees most."""
+    """Points even in the logarithm from a tenth of the first resonance to three times the last, and the resonances with
+    the largest response at the tip."""
     system = example.system
     pair = np.flatnonzero(system.is_pair)
     resonance = system.poles.imag[pair] / (2 * np.pi)

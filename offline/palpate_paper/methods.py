@@ -25,7 +25,7 @@ _EQUAL = 1e-6
 
 @dataclass(frozen=True)
 class Method:
-    """A reduction to `order` states, by (system, band in Hz, order), and how plots show it."""
+    """A reduction to `order` states, by (system, band in Hz, order), and its style in plots."""
 
     name: str
     label: str
@@ -36,7 +36,7 @@ class Method:
 
     @property
     def style(self) -> dict[str, Any]:
-        """For plots of all methods: what another may cover is larger, with an open marker and a wider line."""
+        """Style of the curve; one that another may cover has a larger open marker and a wider line."""
         return {
             "color": self.color,
             "marker": self.marker,
@@ -48,10 +48,10 @@ class Method:
 
 
 def singular_perturbation_balancing(system: PoleResidueSystem, order: int) -> Reduction:
-    """The weak states of the balanced realization follow at once instead of being dropped: exact statics.
+    """The weak states of the balanced realization take their quasi-static values instead of being dropped: exact statics.
 
     The bound is that of balanced truncation (Liu & Anderson 1989). Nearly equal Hankel singular values are kept or dropped
-    together: half of a lightly damped oscillator that follows at once has no meaning.
+    together: half of a lightly damped oscillator has no quasi-static value.
 
     Raises ReductionError where the reduced system is not stable or its poles nearly coincide.
     """
@@ -123,7 +123,7 @@ class Reduced:
 
 
 def reduce_by(method: Method, system: PoleResidueSystem, band_hz: Band, order: int) -> Reduced | None:
-    """The reduced model, or None where the method has none of that order (it says so by ReductionError)."""
+    """The reduced model, or None where the method raises ReductionError for that order."""
     start = time.perf_counter()
     try:
         reduced = method.apply(system, band_hz, order)

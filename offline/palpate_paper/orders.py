@@ -71,7 +71,7 @@ def points(study: Study) -> list[Point]:
 
 
 def error_against_order(study: Study) -> Figure:
-    """Figure 14, which decides what to use: three errors of six methods for three problems."""
+    """Figure 14: three errors of six methods for three problems."""
     measured = points(study)
     fields = (
         ("error_hinf", "largest error\nover largest response"),

@@ -1,4 +1,4 @@
-"""Whether the modes of a discretization decay, and how much damping would make them."""
+"""Whether the modes of a discretization decay, and how much damping would make all of them decay."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from palpate.scene.material import PronySeries
 
 @dataclass(frozen=True)
 class Stability:
-    """What to know about a discretization before reducing it.
+    """Stability of the modes of a discretization.
 
     growing_modes           number of modes with a pole right of the imaginary axis, beyond round-off
     spectral_abscissa_per_s largest real part of all poles, 1/s
@@ -29,7 +29,7 @@ class Stability:
 
 
 def stability(modes: ElasticModes, prony: PronySeries) -> Stability:
-    """Judge the modes with the material's memory. s² + c s + mu has both roots on the left when c² Re mu > (Im mu)²."""
+    """The stability of the modes with the material's memory. s² + c s + mu has both roots on the left when c² Re mu > (Im mu)²."""
     mu = np.asarray(modes.squared_frequencies, dtype=np.complex128)
     size = np.abs(mu)
     round_off = np.finfo(np.float64).eps * size.max()

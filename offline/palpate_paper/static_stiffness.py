@@ -24,8 +24,8 @@ MAX_ITERATIONS = 2000
 def static_stiffness(body: AssembledBody) -> Array:
     """(3 n_contacts, 3 n_contacts), N/m at rest: forces on the tips for unit displacements of each, as in `ElasticModes`.
 
-    Conjugate gradients in the nodal values of a symmetric body: H⁻ᵀ K H⁻¹ is only ever applied, by the sparse LU factor
-    of H. The preconditioner is one component's Laplacian, held at the same nodes by a penalty and factorized once:
+    Conjugate gradients in the nodal values of a symmetric body: H⁻ᵀ K H⁻¹ is applied by the sparse LU factor of H,
+    never formed. The preconditioner is one component's Laplacian, held at the same nodes by a penalty and factorized once:
     elasticity differs from three of them by a factor that the spacing does not enter.
 
     Raises RuntimeError when the iteration does not converge.

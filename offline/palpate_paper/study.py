@@ -1,4 +1,4 @@
-"""What several figures share: the full models, their reductions, and the errors and times of those, each made once."""
+"""Full models, reductions, errors and times that several figures share, each computed once."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ class Comparison:
 
 
 class Study:
-    """Makes the shared parts when they are first asked for and keeps them.
+    """Computes the shared parts on first use and keeps them.
 
     quick  small node clouds
-    note   told what is being worked on
+    note   called with the name of each step
     """
 
     def __init__(self, quick: bool = False, note: Callable[[str], None] = lambda text: None) -> None:

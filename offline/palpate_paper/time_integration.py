@@ -109,7 +109,7 @@ def newmark(
     inputs    (n_samples, n_inputs), m, period_s apart; the body is at rest one period before the first sample
     observed  indices of nodal values (rows of equations.value) whose displacement is returned
 
-    Raises ValueError when the arguments don't fit together or are not finite.
+    Raises ValueError when shapes do not match or inputs are not finite.
     """
     inputs = np.asarray(inputs, dtype=np.float64)
     n_inputs = equations.driving.shape[1]

@@ -1,4 +1,4 @@
-"""The surface of a body from a file, or what keeps the file from being one."""
+"""Loads the surface of a body from a file, and checks that it bounds one body."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.geometry.cloud import TriangleSurface
-from palpate.geometry.readers import ReadError, read_polygons
+from palpate.geometry.readers import Polygons, ReadError, read_polygons
 from palpate.geometry.soundness import Naming, SurfaceError, check_surface
 from palpate.geometry.triangulation import MERGE_TOLERANCE, triangulate, weld
 from palpate.scene.quantities import LONGEST_M, SHORTEST_M, UNITS_M, LengthUnit
@@ -16,7 +17,7 @@ from palpate.scene.quantities import LONGEST_M, SHORTEST_M, UNITS_M, LengthUnit
 
 @dataclass(frozen=True)
 class LoadedSurface:
-    """A closed surface, and what was changed to make it one.
+    """A closed surface, and the changes that were made to the file's.
 
     notes  a sentence each, for the user
     """
@@ -34,17 +35,10 @@ def load_surface(path: Path, unit: LengthUnit = "m") -> LoadedSurface:
     """
     try:
         polygons = read_polygons(path)
+        extent = _extent(polygons, unit)
         triangles, owner = triangulate(polygons)
     except ReadError as error:
         raise SurfaceError(f"{path}: {error}") from error
-    if len(triangles) == 0:
-        raise SurfaceError(f"{path}: the surface is empty: expected faces")
-    extent = np.ptp(polygons.vertices[np.unique(triangles)], axis=0)
-    size_m = float(extent.max()) * UNITS_M[unit]
-    if not SHORTEST_M <= size_m <= LONGEST_M:
-        raise SurfaceError(
-            f"{path}: the surface is {size_m:.3g} m across: expected {SHORTEST_M:g} to {LONGEST_M:g} m; check its unit, here {unit}"
-        )
     tolerance = MERGE_TOLERANCE * float(np.linalg.norm(extent))
     welded = weld(polygons.vertices, triangles, owner, tolerance)
     surface = TriangleSurface(welded.vertices * UNITS_M[unit], welded.triangles.astype(np.int32))
@@ -67,3 +61,16 @@ def load_surface(path: Path, unit: LengthUnit = "m") -> LoadedSurface:
     if welded.n_dropped:
         notes.append(f"{path}: left out {welded.n_dropped:,} triangles that had two corners at one place")
     return LoadedSurface(surface, tuple(notes))
+
+
+def _extent(polygons: Polygons, unit: LengthUnit) -> NDArray[np.float64]:
+    """(3,), in the file's unit. Raises ReadError unless it is that of a body: triangles of other sizes underflow."""
+    if len(polygons.sizes) == 0:
+        raise ReadError("the surface is empty: expected faces")
+    extent = np.ptp(polygons.vertices[polygons.corners], axis=0)
+    size_m = float(extent.max()) * UNITS_M[unit]
+    if not SHORTEST_M <= size_m <= LONGEST_M:
+        raise ReadError(
+            f"the surface is {size_m:.3g} m across: expected {SHORTEST_M:g} to {LONGEST_M:g} m; check its unit, here {unit}"
+        )
+    return extent

@@ -1,4 +1,4 @@
-"""Split the faces of a surface file into triangles, and join vertices that are the same place."""
+"""Split the faces of a surface file into triangles, and merge vertices at the same place."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 MERGE_TOLERANCE = 1e-6
-"""Vertices closer than this part of the body's diagonal are one: six digits are what most programs write."""
+"""Vertices closer than this fraction of the body's diagonal are merged: most programs write six digits."""
 
 
 def triangulate(polygons: Polygons) -> tuple[Indices, Indices]:
-    """Triangles (n_triangles, 3) over the polygons' vertices, and the polygon that each is of (n_triangles,).
+    """Triangles (n_triangles, 3) over the polygons' vertices, and the index of the polygon that each belongs to (n_triangles,).
 
-    A quadrilateral is cut along a diagonal inside it, a polygon with more corners by ear clipping, so concave ones keep
+    A quadrilateral is cut along a diagonal inside it, a polygon with more corners by ear clipping: concave polygons keep
     their outline. Raises ReadError naming a polygon that crosses itself.
     """
     start = np.cumsum(polygons.sizes) - polygons.sizes
@@ -68,7 +68,7 @@ def _cut_quads(quads: Array) -> tuple[Indices, NDArray[np.bool_]]:
 
 
 def _clip_ears(outline: Array) -> Indices | None:
-    """Triangles (n - 2, 3) of a polygon (n, 3) that is nearly flat, turning as it does; None if it crosses itself."""
+    """Triangles (n - 2, 3) of a nearly flat polygon (n, 3), with its orientation; None if it crosses itself."""
     following = np.vstack([outline[1:], outline[:1]])
     normal = np.cross(outline - outline[0], following - outline[0]).sum(axis=0)
     # Seen along the axis that is nearest to the normal, and from the side that it points to.
@@ -90,10 +90,10 @@ class Welded:
 
     vertices   (n_vertices, 3), in the file's unit
     triangles  (n_triangles, 3), indices of vertices
-    owner      (n_triangles,), the face of the file that each is of
+    owner      (n_triangles,), the face of the file that each triangle belongs to
     original   (n_vertices,), a vertex of the file at this place
-    n_merged   places that were joined with another one nearby
-    n_dropped  triangles that had two corners at one place, and are left out
+    n_merged   places that were merged with another one nearby
+    n_dropped  triangles left out because two of their corners are at one place
     """
 
     vertices: Array
@@ -105,7 +105,7 @@ class Welded:
 
 
 def weld(vertices: Array, triangles: Indices, owner: Indices, tolerance: float) -> Welded:
-    """Join vertices no further apart than the tolerance, and drop vertices that no triangle uses."""
+    """Merge vertices no further apart than the tolerance, and drop vertices that no triangle uses."""
     used, corners = np.unique(triangles, return_inverse=True)
     places, first, place = np.unique(vertices[used], axis=0, return_index=True, return_inverse=True)
     pairs = cKDTree(places).query_pairs(tolerance, output_type="ndarray")

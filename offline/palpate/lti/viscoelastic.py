@@ -31,12 +31,12 @@ _SYMMETRY_TOLERANCE = 1e-10  # of the largest entry: what a symmetric computatio
 def viscoelastic_system(modes: ElasticModes, prony: PronySeries) -> PoleResidueSystem:
     """The system from patch displacement (m) to reaction force (N), with all memory states.
 
-    Its groups are the relaxation of the static stiffness (0), then the modes by ascending |mu| (1, 2, ...); complex mu
-    must come with their conjugates, of which one is kept. Where the body is symmetric (K_tt = K_tt^T, c = b^T), so is
+    Group 0 of the poles is the relaxation of the static stiffness, groups 1, 2, ... are the modes by ascending |mu|. Of a
+    conjugate pair of complex mu one is kept. Where the body is symmetric (K_tt = K_tt^T, c = b^T), so is
     the realization: C = B^T.
 
     Raises ValueError where a squared frequency is zero (the body is not held) or not finite, or lacks its conjugate,
-    or where a mode is so exactly critically damped that two of its poles coincide.
+    or where two poles of a mode coincide (critical damping).
     """
     mu, b, c = _half_of_conjugates(modes)
     symmetric = (
@@ -121,7 +121,7 @@ def _half_of_conjugates(
     mu = mu[kept]
     b = modes.input_coupling[kept].astype(np.complex128)
     c = modes.output_coupling[:, kept].astype(np.complex128)
-    # The eigenvectors of a real mode may carry any complex factor, which c b^T does not: take it off.
+    # The eigenvectors of a real mode have an arbitrary complex factor, c b^T has none: divide it out.
     real = mu.imag == 0
     phase = np.where(real, phases(np.asarray(b, dtype=np.complex128)), 1)
     b, c = b / phase[:, None], c * phase
@@ -147,8 +147,8 @@ def _prony_polynomials(prony: PronySeries) -> tuple[Array, Array]:
 def mode_poles(mu: RealOrComplex, prony: PronySeries) -> Complex:
     """(n_modes, M + 2), 1/s: the roots of s² P + mu N for squared frequencies mu (n_modes,), (rad/s)²; mu = 0 is allowed.
 
-    Companion eigenvalues, polished by Newton's method. Those of a real mu are exactly real or in exact conjugate pairs:
-    all steps are the same for a root's conjugate.
+    Companion eigenvalues, polished by Newton's method. The roots of a real mu are exactly real or in exact
+    conjugate pairs, because all steps are the same for a root's conjugate.
     """
     relaxation, stress = _prony_polynomials(prony)
     degree = len(relaxation) + 1
@@ -166,7 +166,7 @@ def mode_poles(mu: RealOrComplex, prony: PronySeries) -> Complex:
 
 
 def _polished(coefficients: RealOrComplex, roots: Complex) -> Complex:
-    """Newton's method from the roots (n, degree), each step kept where it makes the polynomial smaller."""
+    """Newton's method from the roots (n, degree), where a step makes the polynomial smaller."""
     slopes = coefficients[:, 1:] * np.arange(1, coefficients.shape[1])
     value = _evaluate(coefficients, roots)
     for _ in range(4):
@@ -187,7 +187,7 @@ def _residues(
     """(n_modes, M + 2): residues of N s² / (mu (s² P + mu N)) at its poles."""
     coefficients = _characteristic(mu, relaxation, stress)
     slope = _evaluate(coefficients[:, 1:] * np.arange(1, coefficients.shape[1]), poles)
-    # At a pole mu N = -s² P: of the two the one with less cancellation gives the numerator.
+    # At a pole mu N = -s² P: the numerator is computed from the side with less cancellation.
     by_stress, by_relaxation = polynomial.polyval(poles, stress), polynomial.polyval(poles, relaxation)
     condition_stress = polynomial.polyval(np.abs(poles), stress) * np.abs(by_relaxation)
     condition_relaxation = polynomial.polyval(np.abs(poles), relaxation) * np.abs(by_stress)

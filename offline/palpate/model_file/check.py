@@ -1,4 +1,4 @@
-"""What the values of a model must fulfil, whether it is about to be written or has just been read."""
+"""Checks of a model's values, before it is written and after it is read."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LONGEST_TEXT = 200
 
 
 def check_model(model: ReducedModel) -> None:
-    """Check everything about a model but what only a file has.
+    """Check the values of a model; the reader checks what concerns the file.
 
     Raises ModelFileError, in one line that names the field and what was expected.
     """

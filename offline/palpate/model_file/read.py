@@ -1,4 +1,4 @@
-"""Reading a model file that nobody vouches for: what it declares is checked before any of its data is unpacked."""
+"""Reading a model file from an untrusted source: what it declares is checked before any of its data is unpacked."""
 
 from __future__ import annotations
 

@@ -90,13 +90,13 @@ class StateSpace:
 
 @dataclass(frozen=True)
 class Surface:
-    """The body's surface and how it moves with the reduced model's state.
+    """The body's surface and its displacement as a function of the reduced model's state.
 
     vertices     (n_vertices, 3), m, at rest
     triangles    (n_triangles, 3), vertex indices, counter-clockwise from outside
     output       (3 n_vertices, order), float32: displacement in m from the *discrete* state,
                  ordered x, y, z of vertex 0, then of vertex 1, ...
-    feedthrough  (3 n_vertices, n_inputs), float32: the part that follows the newest input at once
+    feedthrough  (3 n_vertices, n_inputs), float32: the part that depends on the newest input directly
     """
 
     vertices: Array
@@ -151,7 +151,7 @@ class AccuracyReport:
 
 @dataclass(frozen=True)
 class ReducedModel:
-    """All that the server needs to run a body, and all that a person needs to trust it.
+    """A reduced model with its surface and its accuracy report.
 
     continuous  the reduced model dx/dt = A x + B u, F = C x + D u (u displacement in m, F force in N)
     discrete    the same sampled at period_s, in the form that runs:

@@ -55,7 +55,7 @@ class Balancing:
         return Matrices(w.T @ self.form.apply(t), w.T @ self.form.b, self.form.c @ t, self.form.d)
 
     def tail(self, order: int) -> float:
-        """The sum of all Hankel singular values beyond the first `order`, as sure as `Gramians.missing`."""
+        """The sum of all Hankel singular values beyond the first `order`, with `Gramians.missing` added."""
         return float(np.sum(self.sigma[order:])) + self.gramians.missing
 
     def separated_orders(self, largest: int, gap: float) -> NDArray[np.intp]:

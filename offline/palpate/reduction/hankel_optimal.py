@@ -8,8 +8,8 @@ Gamma = Sigma_1² - sigma² I and U with B_2 = -C_2^T U orthogonal:
 
 of which the stable part is the answer. The H-infinity error with this D is at most sigma_{r+1} + 2 sum of the later ones.
 
-The Hankel norm of the error is sigma_{r+1} in exact arithmetic. In double precision it differs from that the more, the
-smaller the ratio sigma_{r+1} / sigma_1 is. Measured relative difference: at most 1e-6 down to a ratio of 1e-5; at 1e-7
+The Hankel norm of the error is sigma_{r+1} in exact arithmetic. In double precision the difference
+grows as the ratio sigma_{r+1} / sigma_1 falls. Measured relative difference: at most 1e-6 down to a ratio of 1e-5; at 1e-7
 mostly 1e-5, at worst 4e-3. Orders with a ratio below 1e-9 are not offered.
 """
 
@@ -25,17 +25,17 @@ from palpate.reduction.balancing import Balancing, Matrices
 Array = NDArray[np.float64]
 
 _LOSSLESS = 1e-12
-"""Hankel singular values below it, over the largest, are left out before: they are round-off and spoil the rest."""
+"""Hankel singular values below it, over the largest, are left out first: they are round-off and would spoil the others."""
 
 _LEAST = 1e-9
-"""Smallest sigma_{r+1} / sigma_1 that is approximated: nearer to round-off the all-pass embedding is noise."""
+"""Smallest sigma_{r+1} / sigma_1 that is approximated: below it the all-pass embedding is round-off."""
 
 _EQUAL = 1e-8
-"""Hankel singular values this near to each other, relatively, count as one: the embedding divides by their distance."""
+"""Relative distance up to which Hankel singular values count as one: the embedding divides by their distance."""
 
 
 def hankel_optimal_orders(balancing: Balancing) -> NDArray[np.intp]:
-    """(k,), ascending: the orders r with sigma_r > sigma_{r+1}, the latter above round-off; 0 alone where there is none."""
+    """(k,), ascending: the orders r with sigma_r > sigma_{r+1}, the latter above round-off; only 0 where there is none."""
     orders = balancing.separated_orders(max(balancing.count_above(_LEAST) - 1, 0), _EQUAL)
     return orders[1:] if len(orders) > 1 else orders
 
@@ -99,8 +99,8 @@ def _embedding(balanced: Matrices, sigmas: Array, middle: NDArray[np.intp]) -> M
 def _orthogonal_solution(c2: Array, b2: Array) -> Array:
     """U (m, m) orthogonal with C_2^T U = -B_2, for C_2^T C_2 = B_2 B_2^T, (k, k).
 
-    Fixed by that on k directions; on the others, where any would do, the nearest to the identity, so that the result
-    does not depend on the states' basis.
+    The condition determines U on k directions. On the others any orthogonal map would do: the one nearest to the identity
+    makes the result independent of the basis of the states.
     """
     m, k = c2.shape
     left, _, right = np.linalg.svd(-c2 @ b2)

@@ -1,1 +1,1 @@
-"""What a scene may say: geometry, material, regions."""
+"""The scene file: geometry, material, regions, reduction."""

@@ -1,4 +1,4 @@
-"""Regions of the surface that a scene holds fast. The only definition: `palpate.geometry.regions` finds their nodes."""
+"""Regions of the surface where a scene fixes the nodes. The only definition: `palpate.geometry.regions` finds their nodes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class SphereRegion(Table):
 
 
 class NearestRegion(Table):
-    """The one boundary node nearest to a point; of several as near, the first in the cloud."""
+    """The one boundary node nearest to a point; of several at the same distance, the first in the cloud."""
 
     region: Literal["nearest"] = "nearest"
     point_m: Point

@@ -19,7 +19,7 @@ from palpate.scene.regions import Region
 ReductionMethod = Literal["tbr", "tbr-band", "hankel-optimal", "modal", "modal-static"]
 
 _SHORTEST_TAU_IN_PERIODS = 0.01
-"""A relaxation so much faster than the sampling is a damper, not a branch, and drowns in round-off."""
+"""A faster branch acts as a damper, and its terms are lost in round-off."""
 
 
 class ConfigError(ValueError):
@@ -232,9 +232,12 @@ def check_config(tables: dict[str, Any], origin: str) -> Config:
 
 
 def override_reduction(
-    config: Config, method: str | None, order: int | None, tolerance: float | None, origin: str
+    config: Config, method: str | None, order: int | None, tolerance: float | None
 ) -> Config:
-    """The configuration with parts of its reduction replaced, checked again; order and tolerance displace each other."""
+    """The configuration with parts of its reduction replaced by the command line's; order and tolerance displace each other.
+
+    Raises ConfigError.
+    """
     tables = config.model_dump(mode="json", exclude_none=True)
     reduction = tables["reduction"]
     if method is not None:
@@ -243,7 +246,7 @@ def override_reduction(
         reduction.pop("order", None)
         reduction.pop("tolerance", None)
         reduction |= {k: v for k, v in (("order", order), ("tolerance", tolerance)) if v is not None}
-    return check_config(tables, origin)
+    return check_config(tables, "command line")
 
 
 def canonical_text(config: Config) -> str:

@@ -127,12 +127,19 @@ def test_triangles_that_share_no_vertices_are_one_fault():
     assert len(str(caught.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize("size", [1e-300, 1e-9, 1e9])
+@pytest.mark.parametrize("corners", [3, 4, 6])
+@pytest.mark.parametrize("size", [1e-300, 1e-9, 1e9, 1e29])
 @pytest.mark.filterwarnings("error")
-def test_a_size_that_no_body_has_is_one_plain_error(tmp_path, size):
-    path = tmp_path / "box.obj"
-    lines = ["v {} {} {}".format(*v) for v in BOX.vertices * size]
-    path.write_text("\n".join(lines + ["f {} {} {}".format(*t) for t in BOX.triangles + 1]))
+def test_a_size_that_no_body_has_is_one_plain_error(tmp_path, size, corners):
+    path = tmp_path / "prism.obj"
+    turn = 2 * np.pi * np.arange(corners) / corners
+    ring = size * np.column_stack([np.cos(turn), np.sin(turn), np.zeros(corners)])
+    below, above = (ring + np.array([0, 0, z * size]) for z in (-1.5, 1.5))
+    side = np.arange(corners)
+    faces = [side[::-1], side + corners]
+    faces += [np.array([i, (i + 1) % corners, (i + 1) % corners + corners, i + corners]) for i in side]
+    lines = ["v {} {} {}".format(*v) for v in np.vstack([below, above])]
+    path.write_text("\n".join(lines + ["f " + " ".join(map(str, face + 1)) for face in faces]))
     with pytest.raises(
         SurfaceError, match=re.escape(f"is {3 * size:.3g} m across: expected 1e-06 to 10000 m")
     ) as caught:

@@ -49,6 +49,13 @@ def test_a_concave_quadrilateral_is_cut_inside(turn: int) -> None:
     np.testing.assert_allclose(area_vectors(dart.astype(float), triangles)[:, 2], [1, 1])
 
 
+@pytest.mark.parametrize("turn", range(4))
+def test_a_quadrilateral_with_three_corners_in_a_line_gets_triangles_with_an_area(turn: int) -> None:
+    outline = np.roll([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 2, 0]], turn, axis=0)
+    triangles, _ = triangulate(one_polygon(outline))
+    np.testing.assert_allclose(area_vectors(outline.astype(float), triangles)[:, 2], [1, 1])
+
+
 def test_vertices_on_a_straight_edge_stay_vertices() -> None:
     x = [0, 1, 2, 3, 3, 3, 2, 1, 0, 0]
     y = [0, 0, 0, 0, 1, 2, 2, 2, 2, 1]

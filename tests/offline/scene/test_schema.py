@@ -176,14 +176,14 @@ def test_broken_toml_and_a_missing_file_are_told(tmp_path: Path) -> None:
 
 def test_an_override_displaces_the_other_stopping_rule_and_is_checked() -> None:
     config = check_config(SCENE, "slab.toml")
-    replaced = override_reduction(config, "modal", 40, None, "command line")
+    replaced = override_reduction(config, "modal", 40, None)
     assert (replaced.reduction.method, replaced.reduction.order, replaced.reduction.tolerance) == (
         "modal",
         40,
         None,
     )
     with pytest.raises(ConfigError, match=r"command line: reduction.order"):
-        override_reduction(config, None, 0, None, "command line")
+        override_reduction(config, None, 0, None)
 
 
 def test_the_fingerprint_follows_the_configuration_and_the_surface_file(tmp_path: Path) -> None:
