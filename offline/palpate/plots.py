@@ -1,4 +1,4 @@
-"""Pictures: the poke of the demonstration, and error against order. Needs the extra `plots`."""
+"""The picture of the demonstration. Needs the extra `plots`."""
 
 from __future__ import annotations
 

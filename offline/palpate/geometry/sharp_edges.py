@@ -21,7 +21,7 @@ def sharp_edges(surface: TriangleSurface) -> tuple[Indices, Indices]:
     """
     edges = igl.sharp_edges(surface.vertices, surface.triangles.astype(np.int64), float(SHARP_RAD))
     edges = np.sort(edges, axis=1)
-    edges = edges[np.lexsort(edges.T)]  # whatever order the library has: nodes are placed in this one
+    edges = edges[np.lexsort(edges.T)]  # nodes are placed in this order, whatever the library's is
     directions = surface.vertices[edges[:, 1]] - surface.vertices[edges[:, 0]]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     ends = np.concatenate([edges[:, 0], edges[:, 1]])

@@ -1,4 +1,4 @@
-"""How far apart nodes are to lie, as a function of place: coarse, and finer around chosen points."""
+"""Distance between nodes as a function of place: coarse, and finer around round patches."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def arrays_of(model: ReducedModel) -> dict[str, NDArray[Any]]:
     for group in ("continuous", "discrete", "full", "surface"):
         part = getattr(model, group)
         arrays |= {f"{group}_{field.name}": getattr(part, field.name) for field in fields(part)}
-    del arrays["full_group"]  # which mode a pole belongs to matters to a reduction alone
+    del arrays["full_group"]  # only a reduction needs the mode that a pole belongs to
     return arrays
 
 

@@ -1,4 +1,4 @@
-"""The data classes of a model. `docs/model-file.md` describes them as they lie in a file."""
+"""The data classes of a model. `docs/model-file.md` describes how a file stores them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UNITS = {
 SCALARS = (
     "name", "method", "period_s", "n_nodes", "n_states_full", "config", "config_sha256", "built_with",
 )  # fmt: skip
-"""The fields of `ReducedModel` that stand as they are in the metadata of a file."""
+"""The fields of `ReducedModel` that the metadata of a file states unchanged."""
 
 Array = NDArray[np.float64]
 
@@ -189,7 +189,7 @@ class ReducedModel:
         return 3 * len(self.contacts)
 
     def metadata(self) -> dict[str, Any]:
-        """All but the arrays, as a file holds it: plain numbers, lists and strings."""
+        """All but the arrays, as a file stores it: plain numbers, lists and strings."""
         accuracy = asdict(self.accuracy)
         del accuracy["hankel_singular_values"]
         return {
@@ -203,7 +203,7 @@ class ReducedModel:
         }
 
     def summary(self) -> dict[str, Any]:
-        """What `palpate inspect --json` prints: the metadata without the scene, and what is short of the arrays."""
+        """What `palpate inspect --json` prints: the metadata without the scene, the stiffness and the sizes."""
         metadata = self.metadata()
         del metadata["config"]
         metadata["accuracy"]["hankel_singular_values"] = self.accuracy.hankel_singular_values.tolist()

@@ -36,7 +36,7 @@ def save_model(model: ReducedModel, path: Path, inputs: Iterable[Path] = ()) -> 
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in sorted(members):
             digest.update(name.encode() + b"\0" + members[name])
-            archive.writestr(_entry(name), members[name], compresslevel=1)  # mantissas hardly get smaller
+            archive.writestr(_entry(name), members[name], compresslevel=1)  # mantissas hardly compress
         archive.writestr(_entry(CHECKSUM), _npy(np.frombuffer(digest.digest(), np.uint8), "|u1"))
     write_atomically(path, buffer.getvalue(), inputs)
 

@@ -5,9 +5,12 @@ Format: G. Turk, The PLY Polygon File Format, 1994.
 
 from __future__ import annotations
 
+import io
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any, BinaryIO
 
 from palpate.geometry.readers.polygons import (
     Polygons,
@@ -23,6 +26,7 @@ _CODES = {
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d",
 }  # fmt: skip
 """From the names of types to the codes of `struct`."""
+_COUNTS = {name for name, code in _CODES.items() if code not in "fd"}
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 
@@ -58,9 +62,16 @@ def read_ply(data: bytes) -> Polygons:
     header, body = data[: end.end()], data[end.end() :]
     order, elements = _header(header)
     if order:
-        rows = _binary_rows(body, order, elements)
+        stream = io.BytesIO(body)
+        rows = _rows(elements, lambda element: _binary_row(stream, order, element))
+        if surplus := stream.read().strip():
+            raise ReadError(f"{len(surplus):,} bytes more than the header states")
     else:
-        rows = _text_rows(body, elements, len(re.findall(rb"\r\n|\r|\n", header)))
+        n_header_lines = len(re.findall(rb"\r\n|\r|\n", header))
+        lines = ((number + n_header_lines, line.split()) for number, line in numbered_lines(body))
+        rows = _rows(elements, lambda element: _text_row(*next(lines), element))
+        for number, _ in lines:
+            raise ReadError(f"line {number}: more lines than the header states elements")
 
     vertex, face = (next((e for e in elements if e.name == name), None) for name in ("vertex", "face"))
     axes = [] if vertex is None else [vertex.index(axis) for axis in "xyz"]
@@ -90,7 +101,7 @@ def _header(header: bytes) -> tuple[str, list[_Element]]:
                 order = _BYTE_ORDERS[name]
             case ["element", name, count] if count.isdecimal():
                 elements.append(_Element(name, int(count)))
-            case ["property", "list", count, code, name] if elements and {count, code} <= _CODES.keys():
+            case ["property", "list", count, code, name] if elements and count in _COUNTS and code in _CODES:
                 elements[-1].properties.append(_Property(name, _CODES[code], _CODES[count]))
             case ["property", code, name] if elements and code in _CODES:
                 elements[-1].properties.append(_Property(name, _CODES[code]))
@@ -101,23 +112,24 @@ def _header(header: bytes) -> tuple[str, list[_Element]]:
     return order, elements
 
 
-def _text_rows(body: bytes, elements: list[_Element], n_header_lines: int) -> dict[str, list[Row]]:
-    """All rows of each element, a line each."""
-    lines = ((number + n_header_lines, line.split()) for number, line in numbered_lines(body))
+def _rows(elements: list[_Element], read_row: Callable[[_Element], Row]) -> dict[str, list[Row]]:
+    """All rows of each element. Raises ReadError where the file ends too early."""
     rows: dict[str, list[Row]] = {}
     for element in elements:
         rows[element.name] = []
         for done in range(element.count):
-            number, words = next(lines, (0, []))
-            if not words:
-                raise _truncated(element, done)
-            rows[element.name].append(_text_row(words, element, number))
-    for number, _ in lines:
-        raise ReadError(f"line {number}: more lines than the header states elements")
+            try:
+                rows[element.name].append(read_row(element))
+            except (StopIteration, struct.error):  # the end of the file, or a negative count
+                raise ReadError(
+                    f"truncated: the header states {element.count:,} of '{element.name}', the file ends after {done:,}: copy "
+                    "or export it again"
+                ) from None
     return rows
 
 
-def _text_row(words: list[str], element: _Element, line: int) -> Row:
+def _text_row(line: int, words: list[str], element: _Element) -> Row:
+    """An element from the words of its line. Raises ReadError."""
     row: Row = []
     used = 0
     for p in element.properties:
@@ -133,33 +145,11 @@ def _text_row(words: list[str], element: _Element, line: int) -> Row:
     return row
 
 
-def _binary_rows(body: bytes, order: str, elements: list[_Element]) -> dict[str, list[Row]]:
-    """All rows of each element."""
-    rows: dict[str, list[Row]] = {}
-    position = 0
-    for element in elements:
-        rows[element.name] = []
-        for done in range(element.count):
-            row: Row = []
-            try:
-                for p in element.properties:
-                    count = 1
-                    if p.count_code is not None:
-                        (count,) = struct.unpack_from(order + p.count_code, body, position)
-                        position += struct.calcsize(order + p.count_code)
-                    values = f"{order}{int(count)}{p.code}"
-                    row.append(struct.unpack_from(values, body, position))
-                    position += struct.calcsize(values)
-            except struct.error:  # the end of the file, or a negative count
-                raise _truncated(element, done) from None
-            rows[element.name].append(row)
-    if body[position:].strip():
-        raise ReadError(f"{len(body) - position:,} bytes more than the header states")
-    return rows
+def _binary_row(stream: BinaryIO, order: str, element: _Element) -> Row:
+    """The element that follows in the stream. Raises struct.error at its end."""
 
+    def take(code: str, count: int) -> tuple[Any, ...]:
+        layout = f"{order}{count}{code}"
+        return struct.unpack(layout, stream.read(struct.calcsize(layout)))
 
-def _truncated(element: _Element, done: int) -> ReadError:
-    return ReadError(
-        f"truncated: the header states {element.count:,} of '{element.name}', the file ends after {done:,}: copy or export "
-        "it again"
-    )
+    return [take(p.code, 1 if p.count_code is None else take(p.count_code, 1)[0]) for p in element.properties]

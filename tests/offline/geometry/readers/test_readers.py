@@ -134,6 +134,10 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     "count.ply": (ascii_ply().replace("3 0 2 1", "4 0 2 1").encode("latin-1"), "line 16: 4 numbers, expected 5"),
     "beyond.ply": (ascii_ply().replace("3 0 2 1", "3 0 2 4").encode("latin-1"), "face 0 names vertex 4"),
     "type.ply": (ascii_ply().replace("float y", "quad y").encode("latin-1"), "line 7: 'property quad y'"),
+    "counts.ply": (
+        ply_header("binary_little_endian", face="property list float int vertex_indices").encode("latin-1"),
+        "line 10: 'property list float int vertex_indices'",
+    ),
     "binary.ply": (binary_ply(">")[:-3], "states 4 of 'face', the file ends after 3"),
     "surplus.ply": (binary_ply("<") + b"xx", "2 bytes more"),
     "liver.step": (b"ISO-10303-21;", r"expected a file that ends in \.stl, \.obj, \.ply"),
