@@ -27,7 +27,9 @@ def compiled(
 ) -> Array:
     """(10, nnz): value, three first and six second derivatives."""
     out = np.empty((10, len(indices)))
-    evaluate(points, x, radii, indptr, indices, order, 2, out[0], out[1:4], out[4:], np.empty(len(points)))
+    evaluate(
+        points, x, indptr, indices, radii[indices], order, 2, out[0], out[1:4], out[4:], np.empty(len(points))
+    )
     return out
 
 

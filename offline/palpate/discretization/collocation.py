@@ -39,7 +39,7 @@ def assemble(
     held = supports(cloud.n_nodes, fixed, contacts)
     require_volumes(cloud)
     _require_patches_on_boundary(cloud, held)
-    basis, h = nodal_basis(cloud.points, cloud.spacing, support_radius_factor, derivatives=2)
+    basis, h = nodal_basis(cloud.points, cloud.spacing, support_radius_factor, derivatives=2, gaps=cloud.gaps)
     return AssembledBody(
         basis=basis,
         stiffness=force_operator(cloud, material, h),

@@ -52,7 +52,7 @@ def gradient_at_nodes(
     cloud: NodeCloud, support_radius_factor: float = SUPPORT_RADIUS_FACTOR
 ) -> tuple[NodalBasis, list[csr_array]]:
     """The basis, and [d/dx, d/dy, d/dz] at the nodes, each (n_nodes, n_nodes), 1/m, from the parameters."""
-    basis, h = nodal_basis(cloud.points, cloud.spacing, support_radius_factor, derivatives=1)
+    basis, h = nodal_basis(cloud.points, cloud.spacing, support_radius_factor, derivatives=1, gaps=cloud.gaps)
     areas = vector_areas(cloud)
     return basis, consistent_gradient(cloud.points, cloud.volumes, cloud.spacing, areas, h, basis.radii)
 

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.measures import triangle_normals
 from palpate.geometry.sampling import sample_elements
+from palpate.geometry.tributary import nearest_node
 from palpate.meshfree import ShapeFunctions
 from palpate.meshfree.kernel import quartic_spline
 
@@ -92,7 +93,8 @@ def vector_areas(cloud: NodeCloud) -> Array:
         lambda points: spacing[tree.query(points, workers=-1)[1]],
         1 / SAMPLES_A_SPACING,
     )
-    owner = boundary[tree.query(samples.points, workers=-1)[1]]
+    sight = None if cloud.gaps is None else cloud.gaps.sight(samples.points)
+    owner = boundary[nearest_node(cloud.points[boundary], samples.points, sight)]
     b = np.zeros((cloud.n_nodes, 3))
     np.add.at(b, owner, samples.measures[:, None] * normals[triangle])
     b[boundary] = obeying_divergence_theorem(b[boundary], cloud.points[boundary], float(cloud.volumes.sum()))

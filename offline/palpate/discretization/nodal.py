@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
 from scipy.sparse import csr_array
 
+from palpate.geometry.visibility import Gaps
 from palpate.meshfree import ShapeFunctions, shape_functions
 
 Array = NDArray[np.float64]
@@ -26,11 +27,13 @@ class NodalBasis:
     points  (n_nodes, dim), m
     radii   (n_nodes,), m, support radii
     value   (n_nodes, n_nodes), H: h_J(x_I), well conditioned
+    gaps    of the body, across which no support reaches
     """
 
     points: Array
     radii: Array
     value: csr_array
+    gaps: Gaps | None = None
 
     def on_nodal_values(self, matrix: csr_array | Array) -> Array:
         """(rows, n_nodes): A H⁻¹ for a matrix A (rows, n_nodes) that acts on parameters."""
@@ -44,7 +47,7 @@ class NodalBasis:
 
         Raises SupportError naming the first point that too few nodes cover.
         """
-        return self.on_nodal_values(shape_functions(points, self.points, self.radii).value)
+        return self.on_nodal_values(shape_functions(points, self.points, self.radii, gaps=self.gaps).value)
 
     @cached_property
     def _factor(self) -> tuple[Array, NDArray[np.int32]]:
@@ -53,7 +56,7 @@ class NodalBasis:
 
 
 def nodal_basis(
-    points: Array, spacing: Array, support_radius_factor: float, derivatives: int
+    points: Array, spacing: Array, support_radius_factor: float, derivatives: int, gaps: Gaps | None = None
 ) -> tuple[NodalBasis, ShapeFunctions]:
     """The linear shape functions of all nodes, and their derivatives up to the given one, at all nodes.
 
@@ -63,5 +66,5 @@ def nodal_basis(
     if not (np.isfinite(support_radius_factor) and support_radius_factor > 1):
         raise ValueError(f"support_radius_factor = {support_radius_factor}: expected a number above 1")
     radii = support_radius_factor * spacing
-    h = shape_functions(points, points, radii, order=1, derivatives=derivatives)
-    return NodalBasis(points, radii, h.value), h
+    h = shape_functions(points, points, radii, order=1, derivatives=derivatives, gaps=gaps)
+    return NodalBasis(points, radii, h.value, gaps), h

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from palpate.geometry.visibility import Gaps
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,8 @@ class NodeCloud:
     areas    (n_nodes,), m²; zero at interior nodes, they sum to the body's surface
     boundary (n_nodes,), true on the boundary
     spacing  (n_nodes,), m; local distance between neighboring nodes, from which the support radius follows
-    surface  the body's boundary, for a view
+    surface  the body's boundary
+    gaps     across which nodes are no neighbors; None where there can be none, as in a convex body
     """
 
     points: NDArray[np.float64]
@@ -40,6 +45,7 @@ class NodeCloud:
     boundary: NDArray[np.bool_]
     spacing: NDArray[np.float64]
     surface: TriangleSurface
+    gaps: Gaps | None = None
 
     @property
     def n_nodes(self) -> int:

@@ -16,6 +16,7 @@ from palpate.geometry.sampling import Samples, closest_point, depth_inside, samp
 from palpate.geometry.sharp_edges import sharp_edges
 from palpate.geometry.spacing import Refinement, SpacingField
 from palpate.geometry.tributary import nearest_node, tributary_measures
+from palpate.geometry.visibility import Gaps, find_gaps
 from palpate.scene.quantities import MAX_NODES
 
 Array = NDArray[np.float64]
@@ -52,11 +53,12 @@ def fill_surface(
     _check_spacing(surface, spacing_m, refinements)
     rng = np.random.default_rng(seed)
     field = SpacingField(spacing_m, refinements)
-    boundary = _boundary_nodes(surface, field, rng)
+    gaps = find_gaps(surface, field)
+    boundary = _boundary_nodes(surface, field, gaps, rng)
 
     samples = sample_inside(surface, field, _PLACING)
     room = depth_inside(samples.points, surface) > 0.5 * samples.spacing
-    points = _place(boundary, samples, room, 3, lambda p: p, field, rng)
+    points = _place(boundary, samples, room, 3, lambda p: p, field, gaps, rng)
     n_boundary = len(boundary)
     if len(points) == n_boundary:
         raise ValueError(
@@ -64,16 +66,19 @@ def fill_surface(
         )
 
     areas, normals = np.zeros(len(points)), np.zeros_like(points)
-    areas[:n_boundary], normals[:n_boundary] = _areas_and_normals(boundary, surface, field)
+    areas[:n_boundary], normals[:n_boundary] = _areas_and_normals(boundary, surface, field, gaps)
     samples = sample_inside(surface, field, _MEASURING)
     return NodeCloud(
         points=points,
         normals=normals,
-        volumes=tributary_measures(points, samples.points, samples.measures, enclosed_volume(surface)),
+        volumes=tributary_measures(
+            points, samples.points, samples.measures, enclosed_volume(surface), gaps.sight(samples.points)
+        ),
         areas=areas,
         boundary=np.arange(len(points)) < n_boundary,
         spacing=field(points),
         surface=surface,
+        gaps=gaps,
     )
 
 
@@ -94,17 +99,23 @@ def _check_spacing(surface: TriangleSurface, spacing_m: float, refinements: tupl
         )
 
 
-def _boundary_nodes(surface: TriangleSurface, field: SpacingField, rng: np.random.Generator) -> Array:
+def _boundary_nodes(
+    surface: TriangleSurface, field: SpacingField, gaps: Gaps, rng: np.random.Generator
+) -> Array:
     """(n_boundary, 3): patch rings, then corners, sharp edges and faces of the surface, m."""
     vertices, triangles = surface.vertices, surface.triangles
     nodes = _patches(surface, field)
     edges, corners = sharp_edges(surface)
-    nodes = np.vstack([nodes, _spread(vertices[corners], nodes, 1, field, rng)])
+    nodes = np.vstack([nodes, _spread(vertices[corners], nodes, 1, field, gaps, rng)])
     if len(edges):
         samples, _ = sample_elements(vertices, edges, field, _PLACING / 2)
-        nodes = _place(nodes, samples, None, 1, lambda p: closest_point(p, vertices, edges)[0], field, rng)
+        nodes = _place(
+            nodes, samples, None, 1, lambda p: closest_point(p, vertices, edges)[0], field, gaps, rng
+        )
     samples, _ = sample_elements(vertices, triangles, field, _PLACING)
-    return _place(nodes, samples, None, 2, lambda p: closest_point(p, vertices, triangles)[0], field, rng)
+    return _place(
+        nodes, samples, None, 2, lambda p: closest_point(p, vertices, triangles)[0], field, gaps, rng
+    )
 
 
 def _place(
@@ -114,15 +125,17 @@ def _place(
     dimension: int,
     project: Callable[[Array], Array],
     field: SpacingField,
+    gaps: Gaps,
     rng: np.random.Generator,
 ) -> Array:
     """The fixed nodes and, after them, new ones spread among the samples (those with room, if given) and relaxed."""
     candidates = samples.points if room is None else samples.points[room]
-    free = _spread(candidates, fixed, dimension, field, rng)
+    free = _spread(candidates, fixed, dimension, field, gaps, rng)
+    sight = gaps.sight(samples.points)
     weights = samples.measures / samples.spacing ** (dimension + 2)
     for _ in range(_RELAXATIONS):
         nodes = np.vstack([fixed, free])
-        owner = nearest_node(nodes, samples.points)
+        owner = nearest_node(nodes, samples.points, sight)
         mass = np.bincount(owner, weights, minlength=len(nodes))[len(fixed) :]
         moment = np.column_stack(
             [np.bincount(owner, weights * x, minlength=len(nodes))[len(fixed) :] for x in samples.points.T]
@@ -132,20 +145,39 @@ def _place(
 
 
 def _spread(
-    candidates: Array, fixed: Array, dimension: int, field: SpacingField, rng: np.random.Generator
+    candidates: Array,
+    fixed: Array,
+    dimension: int,
+    field: SpacingField,
+    gaps: Gaps,
+    rng: np.random.Generator,
 ) -> Array:
-    """The candidates in random order, less those within the disc of a fixed node or of one taken before, (n, 3)."""
-    tree = cKDTree(candidates) if len(candidates) else None
+    """The candidates in random order, less those within the disc of a fixed node or of one taken before, (n, 3).
+
+    A disc ends at a gap.
+    """
+    if not len(candidates):
+        return candidates
+    tree = cKDTree(candidates)
+    points = np.vstack([candidates, fixed])
+    beside, eyes = gaps.beside(points), gaps.eyes(points)
+    radii = _DISC[dimension] * field(points)
     alive = np.ones(len(candidates), dtype=bool)
-    if tree is not None and len(fixed):
-        for near in tree.query_ball_point(fixed, _DISC[dimension] * field(fixed)):
-            alive[near] = False
-    radii = _DISC[dimension] * field(candidates)
+
+    def clear_disc(i: int) -> None:
+        near = np.array(tree.query_ball_point(points[i], radii[i]), dtype=np.intp)
+        if beside[i]:
+            near = near[~gaps.hidden(np.tile(eyes[i], (len(near), 1)), eyes[near])]
+        alive[near] = False
+
+    for i in range(len(candidates), len(points)):
+        clear_disc(i)
     taken = []
     for i in rng.permutation(len(candidates)):
-        if alive[i] and tree is not None:
+        if alive[i]:
             taken.append(i)
-            alive[tree.query_ball_point(candidates[i], radii[i])] = False
+            clear_disc(i)
+            alive[i] = False
     return candidates[taken]
 
 
@@ -227,13 +259,16 @@ def _rings(surface: TriangleSurface, patch: Refinement) -> Array:
     return np.vstack(nodes)
 
 
-def _areas_and_normals(nodes: Array, surface: TriangleSurface, field: SpacingField) -> tuple[Array, Array]:
+def _areas_and_normals(
+    nodes: Array, surface: TriangleSurface, field: SpacingField, gaps: Gaps
+) -> tuple[Array, Array]:
     """Areas (n,), m², and unit normals (n, 3) of boundary nodes, over the part of the surface nearest to each."""
     vertices, triangles = surface.vertices, surface.triangles
     face_normals, face_areas = triangle_normals(surface)
     samples, triangle = sample_elements(vertices, triangles, field, _MEASURING)
-    owner = nearest_node(nodes, samples.points)
-    areas = tributary_measures(nodes, samples.points, samples.measures, float(face_areas.sum()))
+    sight = gaps.sight(samples.points)
+    owner = nearest_node(nodes, samples.points, sight)
+    areas = tributary_measures(nodes, samples.points, samples.measures, float(face_areas.sum()), sight)
     # Where the body is thin a node may be nearest to a part of the far side as well; its normal is that of its own.
     _, own = closest_point(nodes, vertices, triangles)
     vectors = face_normals[triangle] * samples.measures[:, None]

@@ -24,9 +24,9 @@ def quartic_spline(s: NDArray[np.float64]) -> NDArray[np.float64]:
 def evaluate(
     points: NDArray[np.float64],
     nodes: NDArray[np.float64],
-    radii: NDArray[np.float64],
     indptr: NDArray[np.int32],
     indices: NDArray[np.int32],
+    reach: NDArray[np.float64],
     order: int,
     derivatives: int,
     value: NDArray[np.float64],
@@ -35,6 +35,8 @@ def evaluate(
     pivot: NDArray[np.float64],
 ) -> None:
     """Fill value (nnz,), first (dim, nnz) and second (dim (dim + 1) / 2, nnz); pivot (n_points,) tells regular supports.
+
+    reach (nnz,), m, is the support radius of each pair of point and node.
 
     With the basis p centered at the point and frozen there, h_J = w_J p_J^T c and A c = p, so differentiating A c = p
     gives every derivative from the same Cholesky factor, with A's own derivatives only ever applied:
@@ -77,10 +79,10 @@ def evaluate(
             count = indptr[i + 1] - start
             scale = 0.0
             for j in range(count):
-                scale = max(scale, radii[indices[start + j]])
+                scale = max(scale, reach[start + j])
             for j in range(count):
                 node = indices[start + j]
-                ratio = scale / radii[node]
+                ratio = scale / reach[start + j]
                 squared = 0.0
                 basis[0, j] = 1.0
                 for a in range(dim):

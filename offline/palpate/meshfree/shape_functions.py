@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from palpate.geometry.visibility import Gaps
 from palpate.meshfree.kernel import evaluate
-from palpate.meshfree.neighbors import covering_nodes
+from palpate.meshfree.neighbors import covering_nodes, covering_nodes_inside
 
 SMALLEST_PIVOT = 1e-8
 """Below this relative Cholesky pivot of the moment matrix half of the digits are lost: the support counts as degenerate."""
@@ -40,11 +41,13 @@ def shape_functions(
     *,
     order: int = 1,
     derivatives: int = 0,
+    gaps: Gaps | None = None,
 ) -> ShapeFunctions:
     """Evaluate the shape functions of all nodes at the points.
 
     points (n_points, dim), nodes (n_nodes, dim), m, with dim 1, 2 or 3; radii (n_nodes,), m, the nodes' support radii.
     order is the degree of the basis that is reproduced exactly, 1 or 2; derivatives is the highest derivative, 0 to 2.
+    With gaps, a support ends where the way to it inside the body is longer than its radius (`covering_nodes_inside`).
 
     Raises SupportError naming the point where the support is too small or degenerate, ValueError on bad arguments.
     """
@@ -64,13 +67,17 @@ def shape_functions(
         if not np.all(np.isfinite(array)):
             raise ValueError(f"{name} holds numbers that are not finite")
 
-    indptr, indices = covering_nodes(points, nodes, radii)
+    if gaps is None:
+        indptr, indices = covering_nodes(points, nodes, radii)
+        reach = radii[indices]
+    else:
+        (indptr, indices), reach = covering_nodes_inside(points, nodes, radii, gaps)
     n_second = dim * (dim + 1) // 2
     value = np.empty(len(indices))
     first = np.empty((dim if derivatives >= 1 else 0, len(indices)))
     second = np.empty((n_second if derivatives >= 2 else 0, len(indices)))
     pivot = np.empty(len(points))
-    evaluate(points, nodes, radii, indptr, indices, order, derivatives, value, first, second, pivot)
+    evaluate(points, nodes, indptr, indices, reach, order, derivatives, value, first, second, pivot)
     _require_regular_supports(points, np.diff(indptr), pivot, 1 + dim + (n_second if order == 2 else 0))
 
     def matrix(data: NDArray[np.float64]) -> csr_array:
