@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from palpate.geometry.cloud import TriangleSurface
@@ -14,9 +14,6 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _MOST_CELLS = 4_000_000
-
-_FEW = 4096
-"""Segments below which starting threads takes longer than the search."""
 
 _SLACK = 1e-9
 """How far beyond a triangle's edge a segment still hits it, and from its own ends no longer, as a fraction of each."""
@@ -44,8 +41,7 @@ class TriangleGrid:
     def crossed(self, starts: Array, ends: Array) -> NDArray[np.bool_]:
         """(n,): whether the segments between the points (n, 3) and (n, 3), m, cross the surface between their ends."""
         starts, ends = np.ascontiguousarray(starts, float), np.ascontiguousarray(ends, float)
-        search = _crossed if len(starts) < _FEW else _crossed_in_parallel
-        return search(
+        return _crossed(
             starts, ends, self.low, self.size_m, self.shape, self.starts, self.members, self.corners
         )
 
@@ -88,7 +84,8 @@ def _cells(first: Indices, last: Indices, shape: Indices) -> tuple[Indices, Indi
     return starts, members
 
 
-def _search(
+@njit(cache=True)
+def _crossed(
     begins: Array,
     ends: Array,
     low: Array,
@@ -99,51 +96,48 @@ def _search(
     corners: Array,
 ) -> NDArray[np.bool_]:
     crossed = np.zeros(len(begins), np.bool_)
-    for i in prange(len(begins)):
-        begin, end = begins[i], ends[i]
-        length = 0.0
-        for a in range(3):
-            length = max(length, abs(end[a] - begin[a]))
-        pieces = int(length / size) + 1
+    for i in range(len(begins)):
+        ax, ay, az = begins[i, 0] - low[0], begins[i, 1] - low[1], begins[i, 2] - low[2]
+        dx, dy, dz = ends[i, 0] - begins[i, 0], ends[i, 1] - begins[i, 1], ends[i, 2] - begins[i, 2]
+        pieces = int(max(abs(dx), abs(dy), abs(dz)) / size) + 1
         for piece in range(pieces):
-            first = np.empty(3, np.int64)
-            last = np.empty(3, np.int64)
-            for a in range(3):
-                p = begin[a] + (end[a] - begin[a]) * piece / pieces - low[a]
-                q = begin[a] + (end[a] - begin[a]) * (piece + 1) / pieces - low[a]
-                first[a] = max(int(np.floor(min(p, q) / size - _SLACK)), 0)
-                last[a] = min(int(np.floor(max(p, q) / size + _SLACK)), shape[a] - 1)
-            for x in range(first[0], last[0] + 1):
-                for y in range(first[1], last[1] + 1):
-                    for z in range(first[2], last[2] + 1):
-                        cell = (x * shape[1] + y) * shape[2] + z
-                        for m in range(starts[cell], starts[cell + 1]):
-                            if not crossed[i] and _crosses(begin, end, corners[members[m]]):
-                                crossed[i] = True
+            s, t = piece / pieces, (piece + 1) / pieces
+            x_first, x_last = _range(ax + s * dx, ax + t * dx, size, shape[0])
+            y_first, y_last = _range(ay + s * dy, ay + t * dy, size, shape[1])
+            z_first, z_last = _range(az + s * dz, az + t * dz, size, shape[2])
+            if z_first > z_last:
+                continue
+            for x in range(x_first, x_last + 1):
+                for y in range(y_first, y_last + 1):
+                    row = (x * shape[1] + y) * shape[2]
+                    for m in range(starts[row + z_first], starts[row + z_last + 1]):
+                        if not crossed[i] and _crosses(begins, ends, i, corners, members[m]):
+                            crossed[i] = True
             if crossed[i]:
                 break
     return crossed
 
 
 @njit(cache=True)
-def _crosses(begin: Array, end: Array, triangle: Array) -> bool:
-    """Whether a segment crosses a triangle (3, 3) (Möller & Trumbore 1997)."""
-    ux, uy, uz = (
-        triangle[1, 0] - triangle[0, 0],
-        triangle[1, 1] - triangle[0, 1],
-        triangle[1, 2] - triangle[0, 2],
-    )
-    vx, vy, vz = (
-        triangle[2, 0] - triangle[0, 0],
-        triangle[2, 1] - triangle[0, 1],
-        triangle[2, 2] - triangle[0, 2],
-    )
-    dx, dy, dz = end[0] - begin[0], end[1] - begin[1], end[2] - begin[2]
+def _range(p: float, q: float, size: float, count: int) -> tuple[int, int]:
+    """First and last cell along an axis between p and q, m from the grid's lowest corner; empty outside the grid."""
+    first = int(np.floor(min(p, q) / size - _SLACK))
+    last = int(np.floor(max(p, q) / size + _SLACK))
+    return max(first, 0), min(last, count - 1)
+
+
+@njit(cache=True)
+def _crosses(begins: Array, ends: Array, i: int, corners: Array, t: int) -> bool:
+    """Whether segment i crosses triangle t (Möller & Trumbore 1997)."""
+    ox, oy, oz = corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]
+    ux, uy, uz = corners[t, 1, 0] - ox, corners[t, 1, 1] - oy, corners[t, 1, 2] - oz
+    vx, vy, vz = corners[t, 2, 0] - ox, corners[t, 2, 1] - oy, corners[t, 2, 2] - oz
+    dx, dy, dz = ends[i, 0] - begins[i, 0], ends[i, 1] - begins[i, 1], ends[i, 2] - begins[i, 2]
     px, py, pz = dy * vz - dz * vy, dz * vx - dx * vz, dx * vy - dy * vx
     determinant = ux * px + uy * py + uz * pz
     if determinant == 0.0:
         return False
-    sx, sy, sz = begin[0] - triangle[0, 0], begin[1] - triangle[0, 1], begin[2] - triangle[0, 2]
+    sx, sy, sz = begins[i, 0] - ox, begins[i, 1] - oy, begins[i, 2] - oz
     u = (sx * px + sy * py + sz * pz) / determinant
     if u < -_SLACK or u > 1 + _SLACK:
         return False
@@ -151,9 +145,5 @@ def _crosses(begin: Array, end: Array, triangle: Array) -> bool:
     v = (dx * qx + dy * qy + dz * qz) / determinant
     if v < -_SLACK or u + v > 1 + _SLACK:
         return False
-    t = (vx * qx + vy * qy + vz * qz) / determinant
-    return _SLACK < t < 1 - _SLACK
-
-
-_crossed = njit(cache=True)(_search)
-_crossed_in_parallel = njit(parallel=True, cache=True)(_search)
+    along = (vx * qx + vy * qy + vz * qz) / determinant
+    return _SLACK < along < 1 - _SLACK

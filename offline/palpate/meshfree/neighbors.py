@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import chain
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
@@ -75,7 +75,7 @@ def _distances_in_sight(
     return (indptr, indices), distance
 
 
-@njit(parallel=True, cache=True)
+@njit(cache=True)
 def _paths(
     indptr: NDArray[np.int32],
     indices: NDArray[np.int32],
@@ -86,7 +86,7 @@ def _paths(
 ) -> Array:
     """The distances (nnz,), where they are inf the shortest by way of one other node in sight of both, m."""
     path = distance.copy()
-    for i in prange(len(indptr) - 1):
+    for i in range(len(indptr) - 1):
         for hidden in range(indptr[i], indptr[i + 1]):
             if not np.isinf(distance[hidden]):
                 continue
