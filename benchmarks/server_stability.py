@@ -7,7 +7,7 @@ each of its ticks, and which command each tick of the server used: jitter, late 
 of 0.05 to 0.2 kg with 0.1 to 2 N s/m, held by a hand (200 N/m, 0.3 N s/m), is pressed 5 mm into the model, with that order of
 events: in pieces of 8 s that begin at random places of what was measured. Beside it, forces that are exactly one, two and
 three ticks old. The model is made softer and stiffer; so are a sample, and a spring without any losses of its own.
-`palpate_server.diagnostics.simulated_device` says how time is modeled and what counts as stable.
+`simulated_device.py` says how time is modeled and what counts as stable.
 
 Colgate & Schenkel (1997): a sampled spring K can't make any passive hand vibrate when b > K (T/2 + D), b being the damping
 of handle and hand, D the time from a position to its force: here the 99th percentile of the age of the forces rendered.
@@ -30,11 +30,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from device_trace import Trace, steady_trace, trace_through_a_model
 from palpate.model_file import ReducedModel, StateSpace, load_model, save_model
-from palpate_server.diagnostics.round_trips import RATE_HZ, Trace, steady_trace, trace_through_a_model
+from palpate_server.diagnostics.round_trips import RATE_HZ
 from palpate_server.diagnostics.sample_model import spring_mass_model
-from palpate_server.diagnostics.simulated_device import Handle, comes_to_rest, press
 from palpate_server.session.devices import PROFILES
+from simulated_device import Handle, comes_to_rest, press
 
 MASSES_KG = (0.05, 0.1, 0.2)
 DAMPINGS_N_S_PER_M = (0.1, 0.5, 1.0, 1.5, 2.0)

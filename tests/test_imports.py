@@ -19,7 +19,12 @@ PACKAGES = {
 
 ALLOWED = {
     "palpate_client": ("palpate.files",),
-    "palpate_server": ("palpate_client.wire", "palpate.model_file", "palpate.files"),
+    "palpate_server": (
+        "palpate_client.wire",
+        "palpate_client.messages",
+        "palpate.model_file",
+        "palpate.files",
+    ),
     "palpate": (),
     "palpate_paper": ("palpate",),
 }

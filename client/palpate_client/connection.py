@@ -9,7 +9,6 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import zenoh
@@ -22,9 +21,9 @@ from palpate_client.messages import (
     Geometry,
     Surface,
     decode_geometry,
-    decode_surface,
     force_of,
     read_description,
+    read_surface,
 )
 
 QUERY_TIMEOUT_S = 3.0
@@ -81,9 +80,7 @@ class Connection:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -161,7 +158,10 @@ class Connection:
         """Ask for one of wire.ACTIONS; `fields` and answer as in docs/wire.md. Raises what `ask` raises."""
         timeout_s = LONG_QUERY_TIMEOUT_S if action in ("load", "record") else QUERY_TIMEOUT_S
         payload = self.ask(self.keys.control(self.name, action), fields, timeout_s=timeout_s)
-        return self._read(payload, wire.Kind.ANSWER)
+        try:
+            return wire.unpack(payload, wire.Kind.ANSWER)
+        except wire.MalformedMessage as error:
+            raise Incompatible(f"the server's answer can't be read: {error}") from error
 
     def geometry(self) -> Geometry:
         """The surface at rest of the model that runs. Raises what `ask` raises."""
@@ -190,20 +190,18 @@ class Connection:
             "sequence": sequence,
             "client_time_ns": now_ns,
             "position_m": position_m,
+            "velocity_m_per_s": velocity_m_per_s,
+            "rendered_tick": rendered_tick,
         }
-        if velocity_m_per_s is not None:
-            command["velocity_m_per_s"] = velocity_m_per_s
-        if rendered_tick is not None:
-            command["rendered_tick"] = rendered_tick
         if before_it_leaves is not None:
             before_it_leaves(sequence, now_ns)
         self._commands.put(wire.pack(command))
         return sequence
 
     def on_message(
-        self, key: str, kind: wire.Kind, receive: Callable[[str, bytes, dict[str, Any], int], None]
+        self, key: str, kind: wire.Kind, receive: Callable[[dict[str, Any], int], None]
     ) -> Subscription:
-        """Call receive(key, payload, message, arrival_ns) for every message of a kind, on a thread of Zenoh's: return quickly.
+        """Call receive(message, arrival_ns) for every message of a kind, on a thread of Zenoh's: return quickly.
 
         Messages of another kind, and those that can't be read, are ignored and counted. Ends with the connection, or with
         `undeclare()` of what is returned.
@@ -211,13 +209,10 @@ class Connection:
 
         def on_sample(sample: Any) -> None:
             arrival_ns = time.monotonic_ns()
-            payload = sample.payload.to_bytes()
             try:
-                message = wire.unpack(payload, kind)
+                receive(wire.unpack(sample.payload.to_bytes(), kind), arrival_ns)
             except wire.MalformedMessage:
                 self.ignored += 1
-                return
-            receive(str(sample.key_expr), payload, message, arrival_ns)
 
         subscriber = self.zenoh.declare_subscriber(key, on_sample)
         self._kept.append(subscriber)
@@ -225,9 +220,7 @@ class Connection:
 
     def on_force(self, receive: Callable[[dict[str, Any], int], None]) -> Subscription:
         """Call receive(message, arrival_ns) for the force message of every tick."""
-        return self.on_message(
-            self.keys.force, wire.Kind.FORCE, lambda key, payload, message, at: receive(message, at)
-        )
+        return self.on_message(self.keys.force, wire.Kind.FORCE, receive)
 
     def on_tool_force(self, tool: str, receive: Callable[[Force], None]) -> Subscription:
         """Call receive(force) for every tick, with what it did with one tool. Raises ValueError when there is none."""
@@ -236,16 +229,12 @@ class Connection:
 
     def on_status(self, receive: Callable[[dict[str, Any]], None]) -> Subscription:
         """Call receive(message) for every status, some ten a second."""
-        return self.on_message(
-            self.keys.status, wire.Kind.STATUS, lambda key, payload, message, at: receive(message)
-        )
+        return self.on_message(self.keys.status, wire.Kind.STATUS, lambda message, at: receive(message))
 
     def on_surface(self, receive: Callable[[Surface], None]) -> Subscription:
         """Call receive(surface) for every surface, some thirty a second; the server computes it only while somebody asks."""
         return self.on_message(
-            self.keys.surface,
-            wire.Kind.SURFACE,
-            lambda key, payload, message, at: receive(decode_surface(payload)),
+            self.keys.surface, wire.Kind.SURFACE, lambda message, at: receive(read_surface(message))
         )
 
     def _join(self) -> None:
@@ -298,12 +287,6 @@ class Connection:
             self._description = read_description(message)
         except (KeyError, TypeError) as error:
             raise Incompatible(f"the server's description can't be read: {error!r}") from error
-
-    def _read(self, payload: bytes, kind: wire.Kind) -> dict[str, Any]:
-        try:
-            return wire.unpack(payload, kind)
-        except wire.MalformedMessage as error:
-            raise Incompatible(f"the server's {kind.value} can't be read: {error}") from error
 
 
 def open_session(endpoint: str, zenoh_config: str | Path | None = None) -> zenoh.Session:

@@ -33,10 +33,16 @@ class Frame:
     model_origin_m: Vector = (0.0, 0.0, 0.0)
 
     def direction_at_client(self, direction: Sequence[float]) -> Vector:
-        """A direction of the model, of length 1, along the client's axes."""
+        """A direction of the model along the client's axes; its length stays."""
         columns = zip(*self.rotation, strict=True)
         x, y, z = (sum(r * d for r, d in zip(column, direction, strict=True)) for column in columns)
         return x, y, z
+
+    def point_at_client(self, point_m: Sequence[float]) -> Vector:
+        """A point of the model, m, in the client's frame, m."""
+        x, y, z = self.direction_at_client([p - o for p, o in zip(point_m, self.model_origin_m, strict=True)])
+        a, b, c = self.client_origin_m
+        return a + x / self.scale, b + y / self.scale, c + z / self.scale
 
     def message(self) -> dict[str, Any]:
         return asdict(self)
@@ -160,7 +166,11 @@ def decode_geometry(payload: bytes) -> Geometry:
 
 def decode_surface(payload: bytes) -> Surface:
     """Raises wire.MalformedMessage."""
-    message = wire.unpack(payload, wire.Kind.SURFACE)
+    return read_surface(wire.unpack(payload, wire.Kind.SURFACE))
+
+
+def read_surface(message: Mapping[str, Any]) -> Surface:
+    """The surface in a decoded message. Raises wire.MalformedMessage."""
     displacement = _numbers(message, "displacement_m", "f")
     try:
         return Surface(message["tick"], message["server_time_ns"], displacement)

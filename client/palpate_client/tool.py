@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any
 
 from palpate_client.connection import Connection, Subscription, steps
@@ -69,9 +68,7 @@ class Tool:
         self._forces = self._connection.on_tool_force(self.name, self._on_force)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if error is None:
             time.sleep(LAST_ANSWERS_S)
         lost = not self.contract.holding

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import IntFlag, StrEnum
 from typing import Any
 
@@ -131,24 +130,20 @@ class MalformedMessage(ValueError):
         self.reason = reason
 
 
-@dataclass(frozen=True)
 class Keys:
     """The key expressions of one session. Raises ValueError for a name that is not 1 to 64 of A-Z a-z 0-9 _ -."""
 
-    session: str = DEFAULT_SESSION
-
-    def __post_init__(self) -> None:
-        if not is_name(self.session):
-            raise ValueError(f"session is {self.session!r}: expected 1 to 64 of A-Z a-z 0-9 _ -")
-
-    @property
-    def prefix(self) -> str:
-        return f"palpate/{self.session}"
-
-    @property
-    def server(self) -> str:
-        """Liveliness token of the server."""
-        return f"{self.prefix}/server"
+    def __init__(self, session: str = DEFAULT_SESSION) -> None:
+        if not is_name(session):
+            raise ValueError(f"session is {session!r}: expected 1 to 64 of A-Z a-z 0-9 _ -")
+        self.session = session
+        self.prefix = f"palpate/{session}"
+        self.server = f"{self.prefix}/server"  # liveliness token of the server
+        self.describe = f"{self.prefix}/describe"
+        self.geometry = f"{self.prefix}/geometry"
+        self.force = f"{self.prefix}/force"
+        self.status = f"{self.prefix}/status"
+        self.surface = f"{self.prefix}/surface"
 
     def client(self, name: str) -> str:
         """Liveliness token of a client: it keeps its tools for as long as this stands."""
@@ -156,26 +151,6 @@ class Keys:
 
     def command(self, client: str) -> str:
         return f"{self.prefix}/command/{client}"
-
-    @property
-    def force(self) -> str:
-        return f"{self.prefix}/force"
-
-    @property
-    def status(self) -> str:
-        return f"{self.prefix}/status"
-
-    @property
-    def surface(self) -> str:
-        return f"{self.prefix}/surface"
-
-    @property
-    def describe(self) -> str:
-        return f"{self.prefix}/describe"
-
-    @property
-    def geometry(self) -> str:
-        return f"{self.prefix}/geometry"
 
     def control(self, client: str, action: str) -> str:
         """The client is in the key, so that access control can bind a name to a certificate."""

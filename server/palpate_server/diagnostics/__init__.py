@@ -1,1 +1,1 @@
-"""Host checks, round trips, metrics and the simulated device."""
+"""Host checks, round trips and metrics."""

@@ -6,8 +6,12 @@ None in an optional field is the same as the field left out.
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
+from palpate_client.messages import Frame, Vector
 from palpate_client.wire import (
     MAX_REQUEST_BYTES,
     SCHEMA_VERSION,
@@ -17,8 +21,11 @@ from palpate_client.wire import (
     unpack_map,
 )
 from palpate_server.session.devices import PROFILES, Device
-from palpate_server.session.frame import ClientFrame, read_frame
 from palpate_server.session.leases import Refused
+
+SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
+FARTHEST_ORIGIN_M = 10.0
+_ORTHONORMAL = 1e-6
 
 
 def read_request(payload: bytes) -> dict[str, Any]:
@@ -52,13 +59,59 @@ def tools_in(request: dict[str, Any]) -> list[str]:
     return tools
 
 
-def frame_in(request: dict[str, Any]) -> ClientFrame:
-    try:
-        return read_frame(request.get("frame"))
-    except TypeError as error:
-        raise MalformedMessage("wrong_type", str(error)) from error
-    except ValueError as error:
-        raise Refused("out_of_range", str(error)) from error
+def frame_in(request: dict[str, Any]) -> Frame:
+    """The frame of a request; fields that are missing or None are those of the identity."""
+    identity = asdict(Frame())
+    value = request.get("frame")
+    if value is None:
+        return Frame()
+    if not isinstance(value, dict):
+        raise MalformedMessage(
+            "wrong_type", f"frame is {shown(value)}: expected a map with {', '.join(identity)}"
+        )
+    if unknown := set(value) - set(identity):
+        raise MalformedMessage(
+            "wrong_type", f"frame has {shown(sorted(map(str, unknown)))}: expected {', '.join(identity)}"
+        )
+    given = identity | {name: each for name, each in value.items() if each is not None}
+    scale = number("frame scale", given["scale"])
+    if not SMALLEST_SCALE <= scale <= LARGEST_SCALE:
+        raise Refused(
+            "out_of_range", f"frame scale is {scale!r}: expected {SMALLEST_SCALE:g} to {LARGEST_SCALE:g}"
+        )
+    origins = [_origin(name, given[name]) for name in ("client_origin_m", "model_origin_m")]
+    return Frame(_rotation(given["rotation"]), scale, *origins)
+
+
+def _rotation(rows: Any) -> tuple[Vector, Vector, Vector]:
+    if not (isinstance(rows, list | tuple) and len(rows) == 3):
+        raise MalformedMessage("wrong_type", f"frame rotation is {shown(rows)}: expected 3 rows of 3 numbers")
+    x, y, z = (_vector("rotation row", row) for row in rows)
+    matrix = np.array((x, y, z))
+    if np.abs(matrix).max() > 2 or np.abs(matrix @ matrix.T - np.eye(3)).max() > _ORTHONORMAL:
+        raise Refused("out_of_range", f"frame rotation is {shown(rows)}: expected orthonormal rows")
+    if np.linalg.det(matrix) < 0:
+        raise Refused(
+            "out_of_range", f"frame rotation is {shown(rows)}: expected right-handed axes, determinant 1"
+        )
+    return x, y, z
+
+
+def _origin(name: str, value: Any) -> Vector:
+    point = _vector(name, value)
+    if max(map(abs, point)) > FARTHEST_ORIGIN_M:
+        raise Refused(
+            "out_of_range",
+            f"frame {name} is {list(point)}: expected no component beyond {FARTHEST_ORIGIN_M:g} m",
+        )
+    return point
+
+
+def _vector(name: str, value: Any) -> Vector:
+    if not (isinstance(value, list | tuple) and len(value) == 3):
+        raise MalformedMessage("wrong_type", f"frame {name} is {shown(value)}: expected 3 numbers")
+    x, y, z = (number(f"frame {name}", each) for each in value)
+    return x, y, z
 
 
 def device_in(request: dict[str, Any]) -> Device | None:

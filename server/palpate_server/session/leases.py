@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from palpate_client.messages import Frame, Vector
 from palpate_server.realtime.safety import Limits
 from palpate_server.session.devices import Device
-from palpate_server.session.frame import ClientFrame, Vector
 
 
 class Refused(Exception):
@@ -28,7 +28,7 @@ class ToolSettings:
     """
 
     limits: Limits
-    frame: ClientFrame
+    frame: Frame
     home_m: Vector
     device: Device | None = None
     since_tick: int = 0

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from palpate_client.messages import Frame
 from palpate_client.wire import ACTIONS
 from palpate_server.realtime import safety, scheduler
 from palpate_server.realtime.safety import Limits
 from palpate_server.session import fields
 from palpate_server.session.devices import Device, limits_for
-from palpate_server.session.frame import ClientFrame
 from palpate_server.session.leases import Refused, ToolSettings
 from palpate_server.session.loading import ModelLoader, warnings_of
 from palpate_server.session.recordings import Recordings
@@ -132,11 +132,11 @@ class Requests:
                 raise Refused("busy", "the force did not fade in time: the server is overloaded")
             time.sleep(state.model.period_s)
 
-    def _set_up(self, name: str, limits: Limits, frame: ClientFrame, device: Device | None) -> None:
+    def _set_up(self, name: str, limits: Limits, frame: Frame, device: Device | None) -> None:
         """Put a silent tool to rest in a client's frame, with these limits."""
         state = self._state
         tool = state.tool_index[name]
-        home = frame.home_m(state.model.contacts[tool].center_m)
+        home = frame.point_at_client(state.model.contacts[tool].center_m)
         settings = state.leases.settings  # true at each moment, also if no tick comes for the second half
         held_since = state.between_ticks(
             scheduler.set_frame, tool, np.array(frame.rotation), frame.scale, np.array(home)

@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from palpate.model_file import ReducedModel
+from palpate_client.messages import Frame
 from palpate_client.wire import MALFORMED, REFUSED, Keys
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import Limits
 from palpate_server.recording import snapshot
 from palpate_server.recording.recorder import Recorder
-from palpate_server.session.frame import IDENTITY
 from palpate_server.session.leases import Leases, Refused, ToolSettings
 
 CHANGE_TIMEOUT_S = 1.0
@@ -60,7 +60,7 @@ class SessionState:
         self.lease_numbers = [0] * len(self.tools)
         self.image = make_image(self.memory)
         self.leases = Leases(
-            {name: ToolSettings(limits, IDENTITY, home) for name, home in zip(self.tools, homes, strict=True)}
+            {name: ToolSettings(limits, Frame(), home) for name, home in zip(self.tools, homes, strict=True)}
         )
         self.messages = MessageCounters()
         self.running = True

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from palpate_client import Frame
 from palpate_server.realtime.safety import Limits
-from palpate_server.session.frame import IDENTITY
 from palpate_server.session.leases import Leases, Refused, ToolSettings
 
-SETTINGS = ToolSettings(Limits(1.0, 1.0, 1.0, 1.0, 0.0), IDENTITY, (0.0, 0.0, 0.0))
+SETTINGS = ToolSettings(Limits(1.0, 1.0, 1.0, 1.0, 0.0), Frame(), (0.0, 0.0, 0.0))
 
 
 def leases_of(*tools: str) -> Leases:

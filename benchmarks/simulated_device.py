@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from device_trace import Trace
 from palpate.model_file import ReducedModel
-from palpate_server.diagnostics.round_trips import Trace
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import Limits

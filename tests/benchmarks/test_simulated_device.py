@@ -11,10 +11,11 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
+from device_trace import Trace, steady_trace, trace_of
 from palpate.model_file import ReducedModel, StateSpace
-from palpate_server.diagnostics.round_trips import Heard, Trace, steady_trace, trace_of
-from palpate_server.diagnostics.simulated_device import Handle, comes_to_rest, press
+from palpate_server.diagnostics.round_trips import Heard
 from palpate_server.realtime import shared_memory
+from simulated_device import Handle, comes_to_rest, press
 
 PERIOD_S = 1e-3
 TICKS = 8000

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from device_trace import trace_of, trace_through_a_model
 from palpate.model_file import save_model
-from palpate_server.diagnostics.round_trips import Heard, trace_of, trace_through_a_model
+from palpate_server.diagnostics.round_trips import Heard
 from palpate_server.diagnostics.sample_model import spring_mass_model
 
 MS = 1_000_000
