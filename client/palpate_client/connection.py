@@ -66,6 +66,8 @@ class Connection:
         self._there = threading.Event()
         self._gone = threading.Event()
         self._stopping = threading.Event()
+        self._status_came = threading.Event()
+        self.status: dict[str, Any] | None = None  # the newest
         self._kept: list[object] = []  # Zenoh ends what is no longer referenced
         self._sequence = 0
         self._zenoh: zenoh.Session | None = None
@@ -117,11 +119,7 @@ class Connection:
         Raises ServerGone when none comes in time, and Incompatible when it serves another model than before.
         """
         before = self.description.config_sha256
-        if not self._there.wait(timeout_s):
-            raise ServerGone(f"no server for {self.keys.prefix} at {self.place} within {timeout_s:g} s")
-        self._stopping.clear()
-        self._gone.clear()
-        self._describe_until(time.monotonic() + QUERY_TIMEOUT_S)
+        self._agree(timeout_s)
         if self.description.config_sha256 != before:
             raise Incompatible("the server that came back serves another model")
 
@@ -231,6 +229,11 @@ class Connection:
         """Call receive(message) for every status, some ten a second."""
         return self.on_message(self.keys.status, wire.Kind.STATUS, lambda message, at: receive(message))
 
+    def next_status(self, timeout_s: float) -> dict[str, Any] | None:
+        """The next status that comes, or None when none comes in time. For one thread at a time."""
+        self._status_came.clear()
+        return self.status if self._status_came.wait(timeout_s) else None
+
     def on_surface(self, receive: Callable[[Surface], None]) -> Subscription:
         """Call receive(surface) for every surface, some thirty a second; the server computes it only while somebody asks."""
         return self.on_message(
@@ -252,9 +255,7 @@ class Connection:
             express=True,
             congestion_control=zenoh.CongestionControl.DROP,
         )
-        if not self._there.wait(QUERY_TIMEOUT_S):
-            raise ServerGone(f"no server for {self.keys.prefix} at {self.place}")
-        self._describe_until(time.monotonic() + QUERY_TIMEOUT_S)
+        self._agree(QUERY_TIMEOUT_S)
 
     def _on_server(self, sample: Any) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
@@ -264,12 +265,19 @@ class Connection:
             self._gone.set()
 
     def _on_status(self, status: dict[str, Any]) -> None:
+        self.status = status
+        self._status_came.set()
         if status.get("state") == "stopping":
             self._stopping.set()
 
-    def _describe_until(self, give_up_s: float) -> None:
-        """Through a router the token may arrive before queries do: ask again for a while, with pauses."""
-        while True:
+    def _agree(self, timeout_s: float) -> None:
+        """Wait for a server, and take up what it says of itself."""
+        if not self._there.wait(timeout_s):
+            raise ServerGone(f"no server for {self.keys.prefix} at {self.place} within {timeout_s:g} s")
+        self._stopping.clear()
+        self._gone.clear()
+        give_up_s = time.monotonic() + QUERY_TIMEOUT_S
+        while True:  # through a router the token may arrive before queries do
             try:
                 message = wire.unpack_map(self.ask(self.keys.describe), wire.MAX_MESSAGE_BYTES)
                 break

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-import threading
 from collections.abc import Sequence
-from typing import Any
 
 import zenoh
 
@@ -17,7 +15,7 @@ from palpate_client.arguments import add_connection_options, connection_for
 from palpate_client.connection import Connection
 from palpate_client.errors import ClientError
 
-PATIENCE_S = 2.0  # a status comes ten times a second
+PATIENCE_S = 1.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,23 +32,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def look(connection: Connection) -> int:
-    statuses: list[dict[str, Any]] = []
-    enough = threading.Event()
-
-    def on_status(status: dict[str, Any]) -> None:
-        statuses.append(status)
-        if len(statuses) == 3:
-            enough.set()
-
-    connection.on_status(on_status)
-    if not enough.wait(PATIENCE_S):
-        print(f"not well: {len(statuses)} status messages in {PATIENCE_S} s, expected 20", file=sys.stderr)
+    first, _, last = (connection.next_status(PATIENCE_S) for _ in range(3))
+    if first is None or last is None:
+        print(f"not well: no status message in {PATIENCE_S} s, expected ten a second", file=sys.stderr)
         return 1
-    ticks = statuses[2]["ticks"]
-    if ticks <= statuses[0]["ticks"]:
+    ticks = last["ticks"]
+    if ticks <= first["ticks"]:
         print(f"not well: the loop stands still at tick {ticks}", file=sys.stderr)
         return 1
-    print(f"well: {statuses[2]['model']['name']}, tick {ticks}")
+    print(f"well: {last['model']['name']}, tick {ticks}")
     return 0
 
 

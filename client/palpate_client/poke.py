@@ -13,7 +13,6 @@ import io
 import json
 import math
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -51,13 +50,12 @@ def run(connection: Connection, options: argparse.Namespace) -> int:
     messages: list[dict[str, Any]] = []
     if options.record:
         connection.on_force(lambda message, arrival_ns: messages.append(message))
-    statuses = Statuses()
-    connection.on_status(statuses.receive)
     interrupted = False
     lost: str | None = None
     held = contextlib.ExitStack()
     held.enter_context(tool)  # an error here is a start that failed, an error below a loss
-    before = statuses.next()
+    connection.next_status(STATUS_WAIT_S)
+    before = connection.status
     try:
         with held:
             poke(tool, motion(options), options)
@@ -67,11 +65,12 @@ def run(connection: Connection, options: argparse.Namespace) -> int:
         lost = str(error)
     except ToolLost:
         pass  # the contract says why
-    after = statuses.newest if lost else statuses.next()
+    if not lost:
+        connection.next_status(STATUS_WAIT_S)
     summary = tool.contract.summary() | {
         "tool": tool.name,
         "server_lost": lost,
-        "not_carried_out": not_carried_out(before, after),
+        "not_carried_out": not_carried_out(before, connection.status),
     }
     if not summary["commands_answered"] and not lost:
         summary["contract_broken"].append("no command was answered")
@@ -105,24 +104,6 @@ def motion(options: argparse.Namespace) -> Callable[[float], tuple[float, float]
     return lambda t: (amplitude_m * math.sin(w * t), amplitude_m * w * math.cos(w * t))
 
 
-class Statuses:
-    """The server's statuses, of which only the newest counts."""
-
-    def __init__(self) -> None:
-        self.newest: dict[str, Any] | None = None
-        self._came = threading.Event()
-
-    def receive(self, status: dict[str, Any]) -> None:
-        self.newest = status
-        self._came.set()
-
-    def next(self) -> dict[str, Any] | None:
-        """One that comes from now on, or the newest when none does."""
-        self._came.clear()
-        self._came.wait(STATUS_WAIT_S)
-        return self.newest
-
-
 def not_carried_out(before: dict[str, Any] | None, after: dict[str, Any] | None) -> dict[str, int] | None:
     """What the server counted between two statuses, of all its clients' commands; None without both statuses."""
     if before is None or after is None:
@@ -138,24 +119,25 @@ def not_carried_out(before: dict[str, Any] | None, after: dict[str, Any] | None)
 
 def wrote(path: str, description: Description, messages: list[dict[str, Any]]) -> bool:
     """Write every tick that was heard as CSV: where each tool was applied, and its force. False, and a line, when it can't."""
-    names = [tool.name for tool in description.tools]
-    header = ["tick", "server_time_ns"]
-    for name in names:
-        header += [f"{name}.sequence", f"{name}.flags", f"{name}.force_scale"]
-        header += [f"{name}.position_{axis}_m" for axis in "xyz"]
-        header += [f"{name}.force_{axis}_n" for axis in "xyz"]
     from palpate.files import write_atomically
 
+    table = io.StringIO(newline="")
+    writer = csv.writer(table)
+    vectors = [
+        f"{name}_{axis}_{unit}" for name, unit in (("position", "m"), ("force", "n")) for axis in "xyz"
+    ]
+    columns = ("sequence", "flags", "force_scale", *vectors)
+    header = [f"{tool.name}.{column}" for tool in description.tools for column in columns]
+    writer.writerow(["tick", "server_time_ns", *header])
+    per_tool = ("sequence", "flags", "force_scale", "position_m", "force_n")
+    for message in messages:
+        row = [message["tick"], message["server_time_ns"]]
+        for sequence, flags, scale, position, force in zip(
+            *(message[name] for name in per_tool), strict=True
+        ):
+            row += [sequence, flags, scale, *position, *force]
+        writer.writerow(row)
     try:
-        table = io.StringIO(newline="")
-        writer = csv.writer(table)
-        writer.writerow(header)
-        for message in messages:
-            row = [message["tick"], message["server_time_ns"]]
-            for i in range(len(names)):
-                row += [message["sequence"][i], message["flags"][i], message["force_scale"][i]]
-                row += message["position_m"][i] + message["force_n"][i]
-            writer.writerow(row)
         write_atomically(Path(path), table.getvalue().encode())
     except OSError as error:
         print(f"palpate client: {error}", file=sys.stderr)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -88,23 +87,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--port", type=port, default=9464, help="to listen on (%(default)s)")
     options = parser.parse_args(arguments)
     collector = StatusCollector()
-    came = threading.Event()
-
-    def on_status(status: dict[str, Any]) -> None:
-        collector.status = status
-        came.set()
-
     try:
         with connection_for(options) as connection:
-            connection.on_status(on_status)
             REGISTRY.register(collector)
             start_http_server(options.port, options.address)
             url = f"http://{options.address}:{options.port}/metrics"
             print(f"metrics of {connection.keys.prefix} on {url}", flush=True)
-            while True:  # until Ctrl-C
-                if not came.wait(1.0):
-                    collector.status = None  # the last one may no longer hold
-                came.clear()
+            while True:  # until Ctrl-C; without a new status the last one may no longer hold
+                collector.status = connection.next_status(1.0)
     except KeyboardInterrupt:
         return 0
     except (ClientError, OSError) as error:

@@ -52,16 +52,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def record(connection: Connection, file: str, stop: threading.Event, duration_s: float) -> dict[str, Any]:
     """Record until `stop` is set, the time is over, or the recording ends; the server's report. Raises ClientError."""
-    newest: list[dict[str, Any] | None] = [None]
     connection.control("record", file=file)
-    connection.on_status(lambda status: newest.__setitem__(0, status["recording"]))
     print(
         printable(f"recording {connection.keys.prefix} to {file} at the server; Ctrl-C ends it"), flush=True
     )
     end_s = time.monotonic() + duration_s
     while not stop.wait(_POLL_S) and time.monotonic() < end_s:
         connection.check()
-        if newest[0] is not None and newest[0]["error"] is not None:
+        recording = connection.status and connection.status["recording"]
+        if recording and recording["file"] == file and recording["error"] is not None:
             break
     report: dict[str, Any] = connection.control("record", file=None)["recording"]
     return report
