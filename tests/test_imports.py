@@ -31,6 +31,7 @@ ALLOWED = {
 """What a package may import of the others: these modules and what is inside them."""
 
 PROGRAMS = {
+    "palpate_server.__main__": ("palpate_client.arguments",),
     "palpate_server.recording.record": ("palpate_client",),
     "palpate_server.diagnostics": ("palpate_client",),
     "palpate.demo": ("palpate_client",),

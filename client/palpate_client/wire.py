@@ -19,6 +19,7 @@ import msgpack
 SCHEMA_VERSION = 2
 ENCODING = f"application/msgpack;palpate.v{SCHEMA_VERSION}"
 DEFAULT_SESSION = "main"
+RECORDER = "recorder"  # the client that may record without a tool
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 # Zenoh's lease on a link, ms: a peer that stays silent for longer counts as gone. It sends KEEP_ALIVES messages in that time
 # at least, so its threads may wait 3.5 s for a processor; those of ordinary priority waited up to 2.4 s on a busy machine.

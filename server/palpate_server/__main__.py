@@ -18,8 +18,9 @@ import zenoh
 
 from palpate.files import printable
 from palpate.model_file import ModelFileError, ReducedModel, load_model
-from palpate_client.wire import DEFAULT_ENDPOINT, Keys
-from palpate_server.arguments import index, need, positive
+from palpate_client.arguments import positive
+from palpate_client.wire import DEFAULT_ENDPOINT, DEFAULT_SESSION, Keys
+from palpate_server.arguments import index, need
 from palpate_server.realtime.safety import Limits, least_force_rate
 from palpate_server.session import log_limit, transport
 from palpate_server.session.loading import accuracy_warnings
@@ -124,8 +125,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("model", type=Path, metavar="MODEL.npz", help="model file made by `palpate build`")
     parser.add_argument(
         "--session",
-        default="main",
-        help="name in the key expressions palpate/SESSION/... (default: %(default)s)",
+        default=DEFAULT_SESSION,
+        help="name in the keys palpate/SESSION/... (default: %(default)s)",
     )
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
@@ -140,24 +141,15 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="Zenoh configuration (JSON5), used as it is: TLS, access control, routers",
     )
-    parser.add_argument(
-        "--models",
-        type=Path,
-        metavar="FOLDER",
-        help="where clients may load other models from while the server runs (default: the folder of MODEL.npz)",
-    )
-    parser.add_argument(
-        "--black-box",
-        type=Path,
-        metavar="FOLDER",
-        help="write the last two seconds there after a fault, a stale input or a storm of limits",
-    )
-    parser.add_argument(
-        "--recordings",
-        type=Path,
-        metavar="FOLDER",
-        help="where clients may have the session recorded to (extra `recorder`; default: they may not)",
-    )
+    for name, text in (
+        ("--models", "where clients may load other models from (default: the folder of MODEL.npz)"),
+        ("--black-box", "write the last two seconds there after a fault, a stale input or a storm of limits"),
+        (
+            "--recordings",
+            "where clients may have the session recorded to (extra `recorder`; default: they may not)",
+        ),
+    ):
+        parser.add_argument(name, type=Path, metavar="FOLDER", help=text)
     parser.add_argument(
         "--max-recordings-gb",
         type=positive,
@@ -179,30 +171,15 @@ def _parser() -> argparse.ArgumentParser:
         help="keep the threads that run ticks on this processor (default: where the system puts them)",
     )
     limits = parser.add_argument_group("limits", "what no client can exceed, for each tool")
-    limits.add_argument(
-        "--max-force-n", type=positive, default=10.0, metavar="N", help="(default: %(default)s)"
-    )
-    limits.add_argument(
-        "--max-force-rate-n-per-s",
-        type=positive,
-        default=2000.0,
-        metavar="N/S",
-        help="(default: %(default)s)",
-    )
-    limits.add_argument(
-        "--max-speed-m-per-s",
-        type=positive,
-        default=1.0,
-        metavar="M/S",
-        help="of a tip (default: %(default)s)",
-    )
-    limits.add_argument(
-        "--workspace-m",
-        type=positive,
-        default=0.1,
-        metavar="M",
-        help="farthest that a tip moves from its start (default: %(default)s)",
-    )
+    for name, default, metavar, text in (
+        ("--max-force-n", 10.0, "N", ""),
+        ("--max-force-rate-n-per-s", 2000.0, "N/S", ""),
+        ("--max-speed-m-per-s", 1.0, "M/S", "of a tip "),
+        ("--workspace-m", 0.1, "M", "farthest that a tip moves from its start "),
+    ):
+        limits.add_argument(
+            name, type=positive, default=default, metavar=metavar, help=f"{text}(default: %(default)s)"
+        )
     return parser
 
 

@@ -3,20 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from importlib.util import find_spec
-
-
-def positive(text: str) -> float:
-    """A finite number above 0. Raises argparse.ArgumentTypeError."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
-    return value
 
 
 def index(text: str) -> int:

@@ -49,27 +49,14 @@ def save(coupling: Any, state: Floats) -> None:
     raise TypeError(_COMPILED_ONLY)
 
 
-def _function(coupling: Any, name: str) -> Callable[..., Any]:
-    tuple_type: Any = coupling.tuple_type if isinstance(coupling, ViewType) else coupling
-    function: Callable[..., Any] = getattr(_MODULES[tuple_type.instance_class], name)
-    return function
+def _compile(function: Callable[..., bool | None]) -> None:
+    """Have compiled code call the function of this name in the coupling's module."""
+
+    @overload(function, strict=False)
+    def choose(coupling, *arguments):
+        tuple_type: Any = coupling.tuple_type if isinstance(coupling, ViewType) else coupling
+        return getattr(_MODULES[tuple_type.instance_class], function.__name__)
 
 
-@overload(advance, strict=False)
-def _advance(coupling, displacement, force):
-    return _function(coupling, "advance")
-
-
-@overload(is_fading, strict=False)
-def _is_fading(coupling):
-    return _function(coupling, "is_fading")
-
-
-@overload(put_to_rest, strict=False)
-def _put_to_rest(coupling):
-    return _function(coupling, "put_to_rest")
-
-
-@overload(save, strict=False)
-def _save(coupling, state):
-    return _function(coupling, "save")
+for _function in (advance, is_fading, put_to_rest, save):
+    _compile(_function)

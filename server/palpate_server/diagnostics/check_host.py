@@ -25,11 +25,11 @@ from pathlib import Path
 import zenoh
 
 from palpate.model_file import save_model
+from palpate_client.arguments import positive
 from palpate_client.connection import open_session
 from palpate_client.errors import ClientError
 from palpate_client.local_server import free_endpoint, running
 from palpate_client.wire import LEASE_MS, Keys
-from palpate_server.arguments import positive
 from palpate_server.diagnostics.round_trips import RoundTrips, ping_pong, through_a_model
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.realtime import scheduler, shared_memory, threads

@@ -1,10 +1,13 @@
-"""Atomic loads and stores on int64 arrays for compiled code: what a loop and its callers share without a Python lock.
+"""Atomic loads and stores on vectors of int64, for compiled code alone.
 
 Plain loads are not enough: the compiler may hoist them out of a loop, and a reader may see half of a write.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, call-arg, arg-type"
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 from numba import types
@@ -21,19 +24,14 @@ _BYTES = 8  # of an int64
 
 def _element(context, builder, signature, args):
     array_type = signature.args[0]
+    if (array_type.ndim, array_type.dtype) != (1, types.int64):
+        raise TypeError(f"{array_type} is no vector of int64")
     array = context.make_array(array_type)(context, builder, args[0])
     return cgutils.get_item_pointer(context, builder, array_type, array, [args[1]])
 
 
-def _is_int64_vector(array) -> bool:
-    return isinstance(array, types.Array) and array.ndim == 1 and array.dtype == types.int64
-
-
 @intrinsic
 def _load(typing_context, array, index):
-    if not _is_int64_vector(array):
-        return None
-
     def codegen(context, builder, signature, args):
         return builder.load_atomic(_element(context, builder, signature, args), "acquire", _BYTES)
 
@@ -42,9 +40,6 @@ def _load(typing_context, array, index):
 
 @intrinsic
 def _store(typing_context, array, index, value):
-    if not _is_int64_vector(array):
-        return None
-
     def codegen(context, builder, signature, args):
         pointer = _element(context, builder, signature, args)
         builder.store_atomic(args[2], pointer, "release", _BYTES)
@@ -55,9 +50,6 @@ def _store(typing_context, array, index, value):
 
 @intrinsic
 def _swap(typing_context, array, index, expected, value):
-    if not _is_int64_vector(array):
-        return None
-
     def codegen(context, builder, signature, args):
         pointer = _element(context, builder, signature, args)
         result = builder.cmpxchg(pointer, args[2], args[3], "acq_rel", "acquire")
@@ -68,7 +60,6 @@ def _swap(typing_context, array, index, expected, value):
 
 @intrinsic
 def _fence(typing_context):
-
     def codegen(context, builder, signature, args):
         builder.fence("seq_cst")
         return context.get_dummy_value()
@@ -76,26 +67,18 @@ def _fence(typing_context):
     return types.void(), codegen
 
 
-@compiled
-def load_acquire(array: Integers, index: int) -> int:
-    """array[index] of an int64 vector; what its writer stored before it is visible afterwards."""
-    return _load(array, index)
+load_acquire = cast(Callable[[Integers, int], int], _load)
+"""array[index]; what its writer stored before is visible afterwards."""
+
+store_release = cast(Callable[[Integers, int, int], None], _store)
+"""array[index] = value; what was stored before is visible to whoever loads it with `load_acquire`."""
+
+compare_and_swap = cast(Callable[[Integers, int, int, int], bool], _swap)
+"""Set array[index] to the last argument if it equals the one before, atomically; whether it did."""
 
 
-@compiled
-def store_release(array: Integers, index: int, value: int) -> None:
-    """array[index] = value on an int64 vector; what was stored before it is visible to whoever loads it."""
-    _store(array, index, value)
-
-
-@compiled
-def compare_and_swap(array: Integers, index: int, expected: int, value: int) -> bool:
-    """Store `value` where array[index] equals `expected`, in one indivisible act; True when it was stored."""
-    return _swap(array, index, expected, value)
-
-
-# A sequence lock: the writer makes the version odd, writes, makes it even; a reader whose version was odd or has
-# changed reads again, up to MAX_READS times. One writer at a time; readers never hold it up, nor it them.
+# A sequence lock. The writer makes the version odd, writes, and makes it even. A reader that saw an odd version, or finds
+# another one afterwards, reads again, up to MAX_READS times. There is one writer at a time; it never waits for a reader.
 
 MAX_READS = 100
 
@@ -113,7 +96,7 @@ def end_write(versions: Integers, index: int) -> None:
 
 @compiled
 def begin_read(versions: Integers, index: int) -> int:
-    """The version to hand to `is_whole`; odd while a write is under way."""
+    """The version to pass to `is_whole`; odd during a write."""
     return _load(versions, index)
 
 

@@ -83,7 +83,6 @@ COUNTERS = np.dtype(
         ("skipped_ticks", _INTEGER),
         ("faults", _INTEGER),
         ("shifted_at", _INTEGER),  # tick before which the deadlines were shifted last
-        ("at_rest_since", _INTEGER),  # tick; -1 while something moves
         ("quiet_ticks", _INTEGER),  # in a row, with every tip at its start and no force
     ]
 )

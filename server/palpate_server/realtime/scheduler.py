@@ -38,8 +38,6 @@ from palpate_server.realtime.port import Record, has_faded
 from palpate_server.realtime.records import RECORDS, Change
 from palpate_server.realtime.shared_memory import (
     CHANGE,
-    CHANGED_AT_TICK,
-    CHANGED_PORT,
     DEADLINE_NS,
     HEAD,
     LOCK,
@@ -132,7 +130,7 @@ def is_silent(image: Image, tool: int) -> bool:
     return has_faded(view(image).ports[tool])
 
 
-# One thread at a time leaves a change in the slot and waits for it with `changed_at`.
+# One thread at a time leaves a change in the slot and waits for it with `is_changed`.
 
 
 @compiled
@@ -167,7 +165,7 @@ def set_frame(image: Image, tool: int, rotation: Floats, scale: float, home: Flo
 @compiled
 def _prepare(m: Memory, tool: int) -> Record:
     """The slot's settings, which are those of the tool until they are changed."""
-    m.changes.integers[CHANGED_PORT] = tool
+    m.changes.port[0] = tool
     m.changes.settings[0] = m.settings[tool]
     return m.changes.settings[0]
 
@@ -196,12 +194,9 @@ def save(image: Image) -> None:
 
 
 @compiled
-def changed_at(image: Image) -> int:
-    """The first tick after the change that was asked for, or -1 while none has carried it out."""
-    m = view(image)
-    if load_acquire(m.shared, CHANGE) != _NO_CHANGE:
-        return -1
-    return m.changes.integers[CHANGED_AT_TICK]
+def is_changed(image: Image) -> bool:
+    """Whether the change that was asked for has been carried out."""
+    return load_acquire(view(image).shared, CHANGE) == _NO_CHANGE
 
 
 @compiled
@@ -223,15 +218,13 @@ def take_up_change(image: Image) -> None:
     if kind == _NO_CHANGE or not compare_and_swap(m.shared, CHANGE, kind, TAKEN):
         return
     changes = m.changes
-    tool = changes.integers[CHANGED_PORT]
+    tool = changes.port[0]
     if kind == _LIMITS:
         m.settings[tool] = changes.settings[0]
     elif kind == _FRAME:
         m.settings[tool] = changes.settings[0]
-        for j in range(3):
-            m.ports[tool].device_m[j] = m.settings[tool].home_m[
-                j
-            ]  # after a reset, though, it is where it was
+        for j in range(3):  # after a reset, though, the device is where it was
+            m.ports[tool].device_m[j] = m.settings[tool].home_m[j]
         put_to_rest(m, tool)
     elif kind == _RESET:
         couplings.put_to_rest(m.coupling)
@@ -239,13 +232,10 @@ def take_up_change(image: Image) -> None:
             m.ports[i].force_scale = 0.0
             put_to_rest(m, i)
     elif kind == _EXCHANGE:
-        m.counters[0].at_rest_since = -1
         m.counters[0].quiet_ticks = 0
         image[:] = changes.image
     _save(view(image))
-    tick = m.counters[0].ticks
-    m.ring.ticks[tick % RECORDS].change = kind
-    changes.integers[CHANGED_AT_TICK] = tick
+    m.ring.ticks[m.counters[0].ticks % RECORDS].change = kind
     store_release(m.shared, CHANGE, _NO_CHANGE)
 
 

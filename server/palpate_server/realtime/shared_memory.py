@@ -35,7 +35,6 @@ HISTOGRAM_BINS = 10_000  # of a microsecond; the last one also holds what is lon
 # Elements of Memory.shared, which all sides load and store atomically. CHANGE is a records.Change while it waits.
 LOCK, DEADLINE_NS, STOP, HEAD, CHANGE = range(5)
 TAKEN = -1  # in CHANGE, by the tick that carries it out
-CHANGED_PORT, CHANGED_AT_TICK = range(2)  # elements of Changes.integers
 TIMER_LATENESS, TICK_LATENESS, COMPUTE_TIME, INPUT_AGE = range(4)  # rows of Memory.histograms
 
 
@@ -59,11 +58,10 @@ class Commands(NamedTuple):
 class Changes(NamedTuple):
     """The slot for one change between two ticks.
 
-    integers (2,): CHANGED_PORT, and CHANGED_AT_TICK, the first tick after it; settings (1,) SETTINGS, of that port; image:
-    of the memory to go on with
+    port (1,), its index; settings (1,) SETTINGS, of that port; image: of the memory to go on with
     """
 
-    integers: Integers
+    port: Integers
     settings: Records
     image: Image
 
@@ -174,7 +172,7 @@ def make_memory(
         force=np.zeros((n, 3)),
         coupling=coupling,
         ring=Ring(np.zeros(RECORDS, TICK), np.zeros((RECORDS, n), PORT_RECORD)),
-        changes=Changes(np.zeros(2, np.int64), np.zeros(1, SETTINGS), native_image.empty_image(_NAME)),
+        changes=Changes(np.zeros(1, np.int64), np.zeros(1, SETTINGS), native_image.empty_image(_NAME)),
         saved=_saved(coupling),
         snapshot=_snapshot(coupling, max(1, round(snapshot_period_s / period_s))),
     )

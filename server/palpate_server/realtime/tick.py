@@ -63,7 +63,7 @@ def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
             m.ports[i].force_scale = 0.0
     for i in range(m.ports.shape[0]):
         _render(m, i, tick, fault)
-    _settle(m, tick)
+    _settle(m)
 
     record.tick = tick
     record.start_ns = start
@@ -137,24 +137,16 @@ def _render(m: Memory, i: int, tick: int, fault: int) -> None:
 
 
 @compiled
-def _settle(m: Memory, tick: int) -> None:
-    """Put the state to zero when what is left of it is negligible, and note since when all is at rest."""
+def _settle(m: Memory) -> None:
+    """Put the state to zero when what is left of it is negligible."""
     counters = m.counters[0]
-    faded, still = True, not couplings.is_fading(m.coupling)
-    for i in range(m.ports.shape[0]):
-        faded = faded and port.has_faded(m.ports[i])
-        for j in range(3):
-            still = still and m.displacement[i, j] == 0.0
-    if not (faded and still):
-        counters.at_rest_since = -1
+    still = not couplings.is_fading(m.coupling)
     for i in range(m.force.shape[0]):
         for j in range(3):
-            still = still and abs(m.force[i, j]) <= _REST_FORCE_N
+            still = still and m.displacement[i, j] == 0.0 and abs(m.force[i, j]) <= _REST_FORCE_N
     counters.quiet_ticks = counters.quiet_ticks + 1 if still else 0
     if counters.quiet_ticks == _REST_TICKS:
         couplings.put_to_rest(m.coupling)
-    if counters.quiet_ticks >= _REST_TICKS and faded and counters.at_rest_since < 0:
-        counters.at_rest_since = tick + 1
 
 
 @compiled

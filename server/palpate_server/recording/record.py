@@ -19,8 +19,9 @@ from typing import Any
 
 from palpate.files import printable
 from palpate_client import ClientError
-from palpate_client.arguments import add_connection_options, connection_for, positive
+from palpate_client.arguments import add_connection_options, connection_for, plain_name, positive
 from palpate_client.connection import Connection
+from palpate_client.wire import RECORDER
 
 _POLL_S = 0.1
 
@@ -29,7 +30,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     about = (__doc__ or "").strip().split("\n\n")
     parser = argparse.ArgumentParser(prog="palpate record", description=about[0], epilog=about[-1])
     parser.add_argument("file", metavar="NAME.mcap", help="a new file's name, without a folder")
-    add_connection_options(parser)
+    add_connection_options(parser, name=False)
+    parser.add_argument(
+        "--name",
+        type=plain_name,
+        default=RECORDER,
+        help="this client's; one of another name has to hold a tool to record (default: %(default)s)",
+    )
     parser.add_argument("--duration-s", type=positive, metavar="S", help="(default: until Ctrl-C)")
     options = parser.parse_args(arguments)
     stop = threading.Event()

@@ -9,9 +9,14 @@ import numpy as np
 from palpate_client.wire import MAX_COMMAND_BYTES, MalformedMessage, check_size, last_chunk
 from palpate_server import wire
 from palpate_server.realtime import scheduler
+from palpate_server.realtime.records import COMMAND
 from palpate_server.session.state import SessionState
 
-_COMMAND = struct.Struct("=6q6d")  # a records.COMMAND
+# Fills a records.COMMAND in a fraction of numpy's time.
+_FIELDS = (COMMAND[name] for name in COMMAND.names or ())
+_COMMAND = struct.Struct(
+    "=" + "".join({"i": "q", "f": "d"}[f.base.kind] * (f.itemsize // 8) for f in _FIELDS)
+)
 
 
 class Admission:

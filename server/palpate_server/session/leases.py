@@ -22,17 +22,13 @@ class Refused(Exception):
 class ToolSettings:
     """The settings of a tool for its present or last holder.
 
-    home_m           the client position at which the tip is at the tool's start
-    since_tick       the first tick with these settings
-    held_since_tick  the first tick of the present hold, which begins at rest
+    home_m  the client position at which the tip is at the tool's start
     """
 
     limits: Limits
     frame: Frame
     home_m: Vector
     device: Device | None = None
-    since_tick: int = 0
-    held_since_tick: int = 0
 
 
 class Leases:
@@ -51,6 +47,11 @@ class Leases:
             holder = self.holders[name]
             if holder is not None and holder != client:
                 raise Refused("held", f"tool {name!r} is held by client {holder!r}")
+
+    def check_holder(self, client: str) -> None:
+        """Raises Refused when a client holds no tool."""
+        if client not in self.holders.values():
+            raise Refused("not_holder", f"client {client!r} holds no tool")
 
     def held_by(self, client: str) -> tuple[str, ...]:
         return tuple(name for name, holder in self.holders.items() if holder == client)

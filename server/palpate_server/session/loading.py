@@ -11,6 +11,7 @@ from palpate.files import LONGEST_NAME_BYTES, is_plain_name
 from palpate.model_file import ModelFileError, ReducedModel
 from palpate_server.coupling import fixed_patch
 from palpate_server.realtime import shared_memory
+from palpate_server.recording.snapshot import identity
 from palpate_server.session.devices import warnings_for
 from palpate_server.session.fields import shown
 from palpate_server.session.leases import Refused
@@ -45,7 +46,7 @@ class ModelLoader:
             for warning in accuracy_warnings(model):
                 log.warning("%s", warning)
             return {
-                "model": {"name": model.name, "order": model.order, "config_sha256": model.config_sha256},
+                "model": identity(model),
                 "warnings": accuracy_warnings(model) + warnings_of(state, state.leases.held_by(client)),
             }
         finally:
@@ -60,7 +61,7 @@ class ModelLoader:
         )
         fading = shared_memory.with_coupling(state.memory, coupling)
         memory = shared_memory.with_coupling(state.memory, fixed_patch.faded_over(coupling))
-        state.undisturbed_since_tick = state.exchange(fading, state.model, model)
+        state.exchange(fading, state.model, model)
         while coupling.fade[0] < 1.0:
             if state.stopping.wait(model.period_s):
                 raise Refused("stopping", "the server is stopping")

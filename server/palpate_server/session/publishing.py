@@ -36,13 +36,7 @@ class ForcePublisher:
         self._ticks, ports = state.memory.ring  # stays the same when the model is exchanged
         self._ports = wire.as_words(ports)
         self._sent = 0
-        self._publisher = session.declare_publisher(
-            state.keys.force,
-            encoding=ENCODING,
-            priority=zenoh.Priority.REAL_TIME,
-            express=True,
-            congestion_control=zenoh.CongestionControl.DROP,
-        )
+        self._publisher = _publisher(session, state.keys.force, zenoh.Priority.REAL_TIME, express=True)
 
     def send(self) -> None:
         """Publish the ticks that are not sent yet, unless another thread is at it (which then is told)."""
@@ -83,12 +77,7 @@ class StatusPublisher:
         self._black_box = black_box
         self._publishing = threading.Lock()
         self._number = 0
-        self._publisher = session.declare_publisher(
-            state.keys.status,
-            encoding=ENCODING,
-            priority=zenoh.Priority.DATA,
-            congestion_control=zenoh.CongestionControl.DROP,
-        )
+        self._publisher = _publisher(session, state.keys.status, zenoh.Priority.DATA)
 
     def publish(self) -> None:
         """Any thread may call this. A mistake in a status does not end the service."""
@@ -110,12 +99,7 @@ class SurfacePublisher:
         self._state = state
         self._tips = np.zeros((len(state.tools), 3))
         self._last_tick = -1
-        self._publisher = session.declare_publisher(
-            state.keys.surface,
-            encoding=ENCODING,
-            priority=zenoh.Priority.DATA_LOW,
-            congestion_control=zenoh.CongestionControl.DROP,
-        )
+        self._publisher = _publisher(session, state.keys.surface, zenoh.Priority.DATA_LOW)
 
     def run(self) -> None:
         """Until the session stops."""
@@ -139,6 +123,15 @@ class SurfacePublisher:
         displacement = surface.output @ model_state.astype(np.float32)
         displacement += surface.feedthrough @ self._tips.ravel().astype(np.float32)
         self._publisher.put(wire.encode_surface(tick, time.monotonic_ns(), displacement))
+
+
+def _publisher(
+    session: zenoh.Session, key: str, priority: zenoh.Priority, express: bool = False
+) -> zenoh.Publisher:
+    drop = zenoh.CongestionControl.DROP
+    return session.declare_publisher(
+        key, encoding=ENCODING, priority=priority, express=express, congestion_control=drop
+    )
 
 
 @contextmanager

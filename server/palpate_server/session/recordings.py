@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from palpate_client.wire import RECORDER
 from palpate_server.realtime import scheduler
 from palpate_server.recording.recorder import Recorder, file_in, room_in
 from palpate_server.session.leases import Refused
@@ -29,8 +30,13 @@ class Recordings:
         self._max_bytes = max_bytes  # that the folder may hold
         self._changing = threading.Lock()  # held while one begins or ends
 
-    def record(self, file: object) -> dict[str, Any]:
-        """Begin a recording in a new file, or end the one that runs when `file` is None. Raises Refused."""
+    def record(self, client: str, file: object) -> dict[str, Any]:
+        """Begin a recording in a new file, or end the one that runs when `file` is None. Raises Refused.
+
+        For clients that hold a tool, and for the one whose name is RECORDER: nobody else can fill the folder.
+        """
+        if client != RECORDER:
+            self._state.leases.check_holder(client)
         if self._folder is None:
             raise Refused("no_recordings", "the server was started without a folder for recordings")
         if not self._changing.acquire(blocking=False):

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from palpate_client.messages import Frame
-from palpate_client.wire import ACTIONS
 from palpate_server.realtime import safety, scheduler
 from palpate_server.realtime.safety import Limits
 from palpate_server.session import fields
@@ -77,10 +76,8 @@ class Requests:
             case "load":
                 return self._loader.load(client, fields.needed(request, "file"))
             case "record":
-                return self.recordings.record(fields.needed(request, "file"))
-        raise Refused(
-            "unknown_action", f"no control action is called {action!r}: there are {', '.join(ACTIONS)}"
-        )
+                return self.recordings.record(client, fields.needed(request, "file"))
+        raise ValueError(f"{action!r} is none of wire.ACTIONS")
 
     def _acquire(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
         tools = fields.tools_in(request)
@@ -138,27 +135,23 @@ class Requests:
         tool = state.tool_index[name]
         home = frame.point_at_client(state.model.contacts[tool].center_m)
         settings = state.leases.settings  # true at each moment, also if no tick comes for the second half
-        held_since = state.between_ticks(
-            scheduler.set_frame, tool, np.array(frame.rotation), frame.scale, np.array(home)
-        )
-        before = settings[name].limits
-        settings[name] = ToolSettings(before, frame, home, device, held_since, held_since)
+        state.between_ticks(scheduler.set_frame, tool, np.array(frame.rotation), frame.scale, np.array(home))
+        settings[name] = ToolSettings(settings[name].limits, frame, home, device)
         # The tip is at rest now: it does not matter that the limits come a tick later.
-        since = state.between_ticks(scheduler.set_limits, tool, np.array(limits))
-        settings[name] = replace(settings[name], limits=limits, since_tick=since)
+        state.between_ticks(scheduler.set_limits, tool, np.array(limits))
+        settings[name] = replace(settings[name], limits=limits)
 
     def _set_limits(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
         state, settings = self._state, self._state.leases.settings
         wanted = fields.limits_in(request, Limits._fields)
+        state.leases.check_holder(client)
         held = state.leases.held_by(client)
-        if not held:
-            raise Refused("not_holder", f"client {client!r} holds no tool")
         for name in held:  # for all of them or for none
             self._check_limits(wanted, settings[name].device)
         for name in held:
             limits = settings[name].limits._replace(**wanted)
-            tick = state.between_ticks(scheduler.set_limits, state.tool_index[name], np.array(limits))
-            settings[name] = replace(settings[name], limits=limits, since_tick=tick)
+            state.between_ticks(scheduler.set_limits, state.tool_index[name], np.array(limits))
+            settings[name] = replace(settings[name], limits=limits)
         return {"tools": {name: {"limits": settings[name].limits._asdict()} for name in held}}
 
     def _check_limits(self, wanted: dict[str, float], device: Device | None) -> None:
@@ -185,7 +178,7 @@ class Requests:
 
     def _reset(self, client: str) -> dict[str, Any]:
         self._state.check_alone(client)
-        self._state.undisturbed_since_tick = self._state.between_ticks(scheduler.reset)
+        self._state.between_ticks(scheduler.reset)
         return {}
 
     def _release(self, client: str) -> tuple[str, ...]:

@@ -40,7 +40,6 @@ class SessionState:
     lease_numbers           of the present hold of each tool, as in the loop's memory
     running                 False once the server stops: commands and requests are then refused
     stopping                set when all threads are to end
-    undisturbed_since_tick  of the last reset or change of model
     lost_clients            clients whose token went while they held a tool
     exchanging              held while a model is loaded or a tool acquired: the one would disturb the other
     model_in_use            held while the surface is computed from the model, and while it is exchanged
@@ -65,7 +64,6 @@ class SessionState:
         self.messages = MessageCounters()
         self.running = True
         self.stopping = threading.Event()
-        self.undisturbed_since_tick = 0
         self.lost_clients = 0
         self.recorder: Recorder | None = None
         self.exchanging = threading.Lock()
@@ -83,8 +81,7 @@ class SessionState:
         for name, holder in self.leases.holders.items():
             if holder not in (None, client):
                 raise Refused("held", f"tool {name!r} is held by client {holder!r}, who would feel it")
-        if not self.leases.held_by(client):
-            raise Refused("not_holder", f"client {client!r} holds no tool")
+        self.leases.check_holder(client)
 
     def forget_commands(self, tools: Iterable[str]) -> None:
         """Let the forces of tools fade from the next tick on."""
@@ -93,33 +90,30 @@ class SessionState:
             scheduler.forget_command(self.memory.commands, tool)
             self.lease_numbers[tool] += 1
 
-    def between_ticks(self, ask: Callable[..., None], *what: Any) -> int:
-        """Have the loop change something; the first tick after it. Raises Refused when no tick comes: nothing is changed."""
+    def between_ticks(self, ask: Callable[..., None], *what: Any) -> None:
+        """Have the loop change something. Raises Refused when no tick comes: nothing is changed."""
         with self._changing:
-            tick = self._change(ask, *what)
+            self._change(ask, *what)
             self._record_settings()
-            return tick
 
     def exchange(
         self, memory: shared_memory.Memory, model: ReducedModel, following: ReducedModel | None
-    ) -> int:
+    ) -> None:
         """Have the loop go on with another memory, of a model and the one that is faded in; like `between_ticks`."""
         with self._changing:
-            tick = self._change(scheduler.exchange, make_image(memory))
+            self._change(scheduler.exchange, make_image(memory))
             self.memory, self.model, self._following = memory, model, following
             self._record_settings()
-            return tick
 
-    def _change(self, ask: Callable[..., None], *what: Any) -> int:
+    def _change(self, ask: Callable[..., None], *what: Any) -> None:
         if self.stopping.is_set():
             raise Refused("stopping", "the server is stopping")
         give_up = time.monotonic() + CHANGE_TIMEOUT_S
         ask(self.image, *what)
-        while (tick := scheduler.changed_at(self.image)) < 0:
+        while not scheduler.is_changed(self.image):
             if time.monotonic() > give_up and scheduler.withdraw_change(self.image):
                 raise Refused("busy", "no tick came that could have made the change")
             time.sleep(self.model.period_s / 4)
-        return tick
 
     def _record_settings(self) -> None:
         """Tell a recording of the change that was made; before the next one, which saves another state."""

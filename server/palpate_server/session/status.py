@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from palpate_client.wire import DROPPED, SCHEMA_VERSION, Flags, Kind
 from palpate_server.realtime import safety, scheduler, shared_memory
-from palpate_server.realtime.records import COUNTERS, RECORDS
+from palpate_server.realtime.records import RECORDS
+from palpate_server.recording.snapshot import identity
 from palpate_server.session.devices import PROFILES
 from palpate_server.session.state import MessageCounters, SessionState
 
@@ -74,16 +75,13 @@ def success_rate(memory: shared_memory.Memory, tool: int) -> float | None:
 def status(state: SessionState, number: int) -> dict[str, Any]:
     """The status message; `number` counts them."""
     memory, messages, model = state.memory, state.messages, state.model
-    counters = dict(zip(COUNTERS.names or (), memory.counters[0].tolist(), strict=True))
     return {
         "kind": Kind.STATUS,
         "number": number,
         "state": "running" if state.running else "stopping",
         "server_time_ns": time.monotonic_ns(),
-        "model": {"name": model.name, "order": model.order, "config_sha256": model.config_sha256},
-        "undisturbed_since_tick": state.undisturbed_since_tick,
-        "at_rest_since_tick": counters["at_rest_since"],
-        **{name: counters[name] for name in _TICK_COUNTERS},
+        "model": identity(model),
+        **{name: int(memory.counters[name][0]) for name in _TICK_COUNTERS},
         "lost_clients": state.lost_clients,
         **{
             name: percentiles(memory.histograms[row].copy(), int(memory.longest_ns[row]))
@@ -107,8 +105,6 @@ def _tool_status(state: SessionState, name: str) -> dict[str, Any]:
         "limits": settings.limits._asdict(),
         "frame": asdict(settings.frame),
         "home_m": settings.home_m,
-        "since_tick": settings.since_tick,
-        "held_since_tick": settings.held_since_tick,
     }
 
 
@@ -127,7 +123,6 @@ def description(state: SessionState) -> dict[str, Any]:
                 "start_m": contact.center_m,
                 "normal": contact.normal,
                 "radius_m": contact.radius_m,
-                "n_nodes": contact.n_nodes,
             }
             for contact in state.model.contacts
         ],

@@ -53,7 +53,7 @@ def _call_each(period_s: float, n_tools: int) -> None:
     scheduler.reset(image)
     scheduler.save(image)
     scheduler.exchange(image, make_image(memory))
-    scheduler.changed_at(image)
+    scheduler.is_changed(image)
     scheduler.withdraw_change(image)
     scheduler.read_snapshot(image, np.zeros(2), np.zeros((n_tools, 3)))
     scheduler.stop(memory.shared)
