@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +14,7 @@ from palpate.model_file import save_model
 from palpate_client.connection import open_session
 from palpate_client.local_server import free_endpoint
 from palpate_client.wire import Keys
+from palpate_server.diagnostics.check_host import busy_loops
 from palpate_server.diagnostics.sample_model import spring_mass_model
 
 CLIENTS, LOOPS, RUNS = 3, 4, 10
@@ -42,22 +40,6 @@ with open_session(sys.argv[1]) as session:
 """
 
 
-@contextmanager
-def _busy_loops() -> Iterator[None]:
-    """In the session of the clients. They end by themselves should the test be killed."""
-    loop = "import time\nend = time.monotonic() + 120\nwhile time.monotonic() < end: pass"
-    processes: list[subprocess.Popen[bytes]] = []
-    try:
-        for _ in range(LOOPS):
-            processes.append(subprocess.Popen([sys.executable, "-c", loop]))
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-        for process in processes:
-            process.wait()
-
-
 def _keeps_its_clients(start: Callable[..., Any], folder: Path, seconds: float) -> None:
     """A server's clients see its token once, and it stays for this long beside busy loops, counted by the forces."""
     model = spring_mass_model(1, 20)
@@ -78,7 +60,7 @@ def _keeps_its_clients(start: Callable[..., Any], folder: Path, seconds: float) 
         if forces * model.period_s > seconds:
             enough.set()
 
-    with _busy_loops(), open_session(endpoint) as session:
+    with busy_loops(LOOPS, 120.0, apart=False), open_session(endpoint) as session:
         session.declare_subscriber(KEYS.force, count)
         assert enough.wait(4 * seconds), f"{forces} forces came"
     for client in clients:

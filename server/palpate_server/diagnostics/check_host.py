@@ -32,16 +32,16 @@ from palpate_client.local_server import free_endpoint, running
 from palpate_client.wire import LEASE_MS, Keys
 from palpate_server.diagnostics.round_trips import RoundTrips, ping_pong, through_a_model
 from palpate_server.diagnostics.sample_model import spring_mass_model
-from palpate_server.realtime import scheduler, shared_memory, threads
-from palpate_server.realtime.native_image import make_image
-from palpate_server.realtime.safety import Limits
-from palpate_server.session import status
+from palpate_server.realtime import threads
 
 GOOD, MARGINAL, NOT_SUFFICIENT = "good", "marginal", "not sufficient"
-_TIMER_S = 3.0
+_PING_PONG_S = 3.0
 _LOAD_S = 5.0
 _LONGEST_S = 3600.0
 _COMMAND_BYTES, _FORCE_BYTES = 90, 220
+
+
+Value = float | str | bool | None
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Finding:
 
     name: str
     text: str
-    values: Mapping[str, float | str | bool | None]
+    values: Mapping[str, Value]
     verdict: str
     advice: str = ""
 
@@ -74,7 +74,7 @@ ROUND_TRIP_P99_S = Bounds(1e-3, 3e-3)
 UNANSWERED_SHARE = Bounds(0.01, 0.1)  # of commands: lost, or replaced by a newer one before a tick
 LATE_SHARE = Bounds(0.001, 0.01)
 SKIPPED_SHARE = Bounds(0.0, 0.001)
-LOAD_PER_CPU = Bounds(0.3, 0.8)
+LOAD_PER_CPU = 0.3
 SILENCE_IN_LEASES = Bounds(0.25, 0.75)  # a link is lost after one
 
 
@@ -84,77 +84,40 @@ def worst(verdicts: Sequence[str]) -> str:
 
 def settings() -> list[Finding]:
     """What the kernel and this user's limits allow. A setting alone never makes a machine insufficient."""
-    findings = []
     cpus = len(os.sched_getaffinity(0))
-    findings.append(
-        Finding(
-            "processors",
-            str(cpus),
-            {"processors": cpus},
-            GOOD if cpus >= 2 else MARGINAL,
-            "give the server two processors",
-        )
-    )
     load = os.getloadavg()[0] / cpus
-    findings.append(
-        Finding(
-            "load per processor",
-            f"{load:.2f}",
-            {"load_per_processor": load},
-            min_marginal(LOAD_PER_CPU.judge(load)),
-            "stop other programs",
-        )
-    )
-    preempt = Path("/sys/kernel/realtime")
-    real_time = preempt.is_file() and preempt.read_text().strip() == "1"
-    findings.append(
-        Finding(
-            "real-time kernel",
-            "yes" if real_time else "no",
-            {"real_time_kernel": real_time},
-            GOOD if real_time else MARGINAL,
-            "a PREEMPT_RT kernel",
-        )
-    )
-    governor = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
-    if governor.is_file():
-        name = governor.read_text().strip()
-        findings.append(
-            Finding(
-                "frequency governor",
-                name,
-                {"governor": name},
-                GOOD if name == "performance" else MARGINAL,
-                "cpupower frequency-set -g performance",
-            )
-        )
+    real_time = _read("/sys/kernel/realtime") == "1"
+    governor = _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
     refusal = _try_priority()
-    findings.append(
-        Finding(
-            "real-time priority",
-            refusal or "allowed",
-            {"allowed": refusal is None},
-            MARGINAL if refusal else GOOD,
-            refusal or "",
-        )
-    )
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     locked = soft == resource.RLIM_INFINITY or os.geteuid() == 0
-    findings.append(
-        Finding(
+    findings = [
+        _setting("processors", str(cpus), cpus, cpus >= 2, "give the server two processors"),
+        _setting("load per processor", f"{load:.2f}", load, load <= LOAD_PER_CPU, "stop other programs"),
+        _setting(
+            "real-time kernel", "yes" if real_time else "no", real_time, real_time, "a PREEMPT_RT kernel"
+        ),
+        _setting("real-time priority", refusal or "allowed", refusal is None, not refusal, refusal or ""),
+        _setting(
             "locked memory",
             "unlimited" if locked else f"{soft} bytes",
-            {"allowed_bytes": None if locked else soft},
-            GOOD if locked else MARGINAL,
+            None if locked else soft,
+            locked,
             "ulimit -l unlimited",
-        )
-    )
+        ),
+    ]
+    if governor is not None:
+        advice = "cpupower frequency-set -g performance"
+        findings.append(_setting("governor", governor, governor, governor == "performance", advice))
     return findings
 
 
-def min_marginal(verdict: str) -> str:
-    """The verdict of a setting: at worst marginal, since only measurements make a machine insufficient."""
-    return MARGINAL if verdict == NOT_SUFFICIENT else verdict
+def _setting(name: str, text: str, value: Value, good: bool, advice: str) -> Finding:
+    return Finding(name, text, {name.replace(" ", "_"): value}, GOOD if good else MARGINAL, advice)
+
+
+def _read(path: str) -> str | None:
+    return Path(path).read_text().strip() if Path(path).is_file() else None
 
 
 def _try_priority() -> str | None:
@@ -165,48 +128,10 @@ def _try_priority() -> str | None:
     return result[0]
 
 
-def timer(seconds: float = _TIMER_S) -> Finding:
-    """Lateness of the deadline loop alone."""
-    model = spring_mass_model(n_modes=2)
-    memory = shared_memory.make_memory(model.discrete, model.period_s, [Limits(1.0, 1.0, 1.0, 1.0, 0.0)], 1.0)
-    image = make_image(memory)
-    scheduler.stop(memory.shared)
-    wake = os.eventfd(0)
-    scheduler.run_at_deadlines(image, wake)  # compiled
-    memory.shared[shared_memory.STOP] = 0
-    memory.shared[shared_memory.DEADLINE_NS] = time.monotonic_ns()
-
-    def run() -> None:
-        threads.raise_priority()
-        scheduler.run_at_deadlines(image, wake)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        time.sleep(seconds)
-    finally:
-        scheduler.stop(memory.shared)
-        thread.join()
-        os.close(wake)
-    lateness = status.percentiles(
-        memory.histograms[shared_memory.TIMER_LATENESS], int(memory.longest_ns[shared_memory.TIMER_LATENESS])
-    )
-    p50, p99 = lateness["p50"], lateness["p99"]
-    assert p50 is not None
-    assert p99 is not None
-    return Finding(
-        "timer lateness",
-        f"p50 {p50 * 1e6:.0f} us, p99 {p99 * 1e6:.0f} us",
-        {"p50_s": p50, "p99_s": p99},
-        TIMER_LATENESS_P99_S.judge(p99),
-        "allow real-time priority, use a real-time kernel, stop other programs",
-    )
-
-
-def transport_round_trip(seconds: float = _TIMER_S) -> list[Finding]:
+def transport_round_trip(seconds: float = _PING_PONG_S) -> list[Finding]:
     trips = ping_pong(_COMMAND_BYTES, _FORCE_BYTES, seconds)
     advice = "stop other programs; check what else uses the loopback device"
-    return [_duration("Zenoh round trip", trips, advice), _unanswered("unanswered pings", trips, advice)]
+    return [_round_trip("Zenoh round trip", trips, advice), _unanswered("unanswered pings", trips, advice)]
 
 
 def tick_run(seconds: float) -> list[Finding]:
@@ -215,10 +140,18 @@ def tick_run(seconds: float) -> list[Finding]:
         path = Path(folder) / "sample.npz"
         save_model(spring_mass_model(n_modes=50), path)
         trips, status = through_a_model(path, "tip", seconds, viewer=True)
+    timer = status["timer_lateness_s"]
     late = status["late_ticks"] / max(status["ticks"], 1)
     skipped = status["skipped_ticks"] / max(status["ticks"], 1)
     return [
-        _duration("command to force", trips, "see timer and round trip"),
+        _duration(
+            "timer lateness",
+            timer["p50"],
+            timer["p99"],
+            TIMER_LATENESS_P99_S,
+            "allow real-time priority, use a real-time kernel, stop other programs",
+        ),
+        _round_trip("command to force", trips, "see timer and round trip"),
         _unanswered("unanswered commands", trips, "see timer and round trip"),
         _share("late ticks", late, LATE_SHARE, "allow real-time priority"),
         _share("skipped ticks", skipped, SKIPPED_SHARE, "stop other programs"),
@@ -265,13 +198,16 @@ def under_load(seconds: float = _LOAD_S) -> Finding:
 
 
 @contextlib.contextmanager
-def busy_loops(number: int, longest_s: float) -> Iterator[None]:
-    """Keep processors busy with processes, each in a session of its own. They end after `longest_s` even if we are killed."""
+def busy_loops(number: int, longest_s: float, *, apart: bool = True) -> Iterator[None]:
+    """Keep processors busy with processes, each in a session of its own if `apart`: the kernel shares between sessions first.
+
+    They end after `longest_s` even if we are killed.
+    """
     loop = f"import time\nend = time.monotonic() + {longest_s}\nwhile time.monotonic() < end: pass"
     processes = []
     try:
         for _ in range(number):
-            processes.append(subprocess.Popen([sys.executable, "-c", loop], start_new_session=True))
+            processes.append(subprocess.Popen([sys.executable, "-c", loop], start_new_session=apart))
         yield
     finally:
         for process in processes:
@@ -280,10 +216,13 @@ def busy_loops(number: int, longest_s: float) -> Iterator[None]:
             process.wait()
 
 
-def _duration(name: str, trips: RoundTrips, advice: str) -> Finding:
-    text = f"p50 {trips.p50_s * 1e6:.0f} us, p99 {trips.p99_s * 1e6:.0f} us"
-    values = {"p50_s": trips.p50_s, "p99_s": trips.p99_s}
-    return Finding(name, text, values, ROUND_TRIP_P99_S.judge(trips.p99_s), advice)
+def _duration(name: str, p50_s: float, p99_s: float, bounds: Bounds, advice: str) -> Finding:
+    text = f"p50 {p50_s * 1e6:.0f} us, p99 {p99_s * 1e6:.0f} us"
+    return Finding(name, text, {"p50_s": p50_s, "p99_s": p99_s}, bounds.judge(p99_s), advice)
+
+
+def _round_trip(name: str, trips: RoundTrips, advice: str) -> Finding:
+    return _duration(name, trips.p50_s, trips.p99_s, ROUND_TRIP_P99_S, advice)
 
 
 def _unanswered(name: str, trips: RoundTrips, advice: str) -> Finding:
@@ -303,22 +242,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     hints = settings()
     try:
-        measured = [timer(), *transport_round_trip(), *tick_run(options.seconds), under_load()]
+        measured = [*transport_round_trip(), *tick_run(options.seconds), under_load()]
     except ClientError as error:
         print(f"palpate check-host: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
     verdict = worst([finding.verdict for finding in measured])
+    findings = [*hints, *measured]
     if options.json:
-        print(
-            json.dumps({"verdict": verdict, "findings": [asdict(f) for f in (*hints, *measured)]}, indent=2)
-        )
+        print(json.dumps({"verdict": verdict, "findings": [asdict(f) for f in findings]}, indent=2))
     else:
-        for finding in (*hints, *measured):
+        for finding in findings:
             print(f"{finding.name:20} {finding.verdict:15} {finding.text}")
         print(f"\nverdict: {verdict}")
-        for finding in (*hints, *measured):
+        for finding in findings:
             if finding.verdict != GOOD:
                 print(f"  {finding.name}: {finding.advice}")
     return 1 if verdict == NOT_SUFFICIENT else 0

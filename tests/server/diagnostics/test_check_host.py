@@ -87,7 +87,6 @@ def test_the_exit_code_says_whether_the_machine_is_sufficient(
     worst_share: float, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     finding = Finding("share", "", {}, check_host.UNANSWERED_SHARE.judge(worst_share))
-    monkeypatch.setattr(check_host, "timer", lambda: finding)
     monkeypatch.setattr(check_host, "transport_round_trip", lambda: [finding])
     monkeypatch.setattr(check_host, "tick_run", lambda seconds: [finding])
     monkeypatch.setattr(check_host, "under_load", lambda: finding)
