@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import threading
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,11 +13,12 @@ import pytest
 import zenoh
 
 from palpate.model_file import save_model
-from palpate_client.connection import open_session
+from palpate_client.connection import Connection, open_session
 from palpate_client.local_server import free_endpoint
-from palpate_client.wire import Keys
+from palpate_client.wire import RECORDER, Keys
 from palpate_server.diagnostics.check_host import busy_loops
 from palpate_server.diagnostics.sample_model import spring_mass_model
+from palpate_server.realtime import threads
 
 CLIENTS, LOOPS, RUNS = 3, 4, 10
 KEYS = Keys("test")
@@ -68,6 +71,41 @@ def _keeps_its_clients(start: Callable[..., Any], folder: Path, seconds: float) 
         assert client.printed().split() == ["PUT"]
         client.process.kill()
     assert server.stop() == 0
+
+
+def test_status_and_queries_run_before_ordinary_programs_and_what_the_server_starts_does_not(
+    start: Callable[..., Any], tmp_path: Path
+) -> None:
+    save_model(spring_mass_model(), tmp_path / "model.npz")
+    endpoint = free_endpoint()
+    server = start(
+        *("-m", "palpate_server", tmp_path / "model.npz", "--listen", endpoint),
+        *("--recordings", tmp_path),
+        ready="serving",
+    )
+    pid = server.process.pid
+    priorities = Counter(
+        os.sched_getparam(int(task.name)).sched_priority for task in Path(f"/proc/{pid}/task").iterdir()
+    )
+    if threads.LOOP_PRIORITY not in priorities:
+        pytest.skip("real-time priority is not allowed here")
+    assert os.sched_getparam(pid).sched_priority == threads.SERVICE_PRIORITY  # sends the status
+    assert priorities[threads.SERVICE_PRIORITY] == 3  # and queries, and the surface
+    with Connection(endpoint, name=RECORDER) as connection:
+        connection.control("record", file="a.mcap")
+        (writer,) = _children(pid)
+        assert os.sched_getscheduler(int(writer)) == os.SCHED_OTHER
+        connection.control("record", file=None)
+    assert server.stop() == 0
+
+
+def _children(pid: int) -> list[str]:
+    """Of all threads of a process."""
+    return [
+        child
+        for task in Path(f"/proc/{pid}/task").iterdir()
+        for child in (task / "children").read_text().split()
+    ]
 
 
 def test_no_client_loses_the_server_beside_busy_loops(start: Callable[..., Any], tmp_path: Path) -> None:

@@ -12,10 +12,11 @@ import msgpack
 import numpy as np
 import pytest
 
-from palpate_client import decode_geometry, decode_surface
+from palpate_client import Frame, decode_geometry, decode_surface
 from palpate_client.messages import force_of, read_description
-from palpate_client.wire import ACTIONS, Kind
+from palpate_client.wire import ACTIONS, Flags, Kind, unpack
 from palpate_server import wire
+from palpate_server.session.devices import PROFILES, stiffness_warnings
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
 EXAMPLE = re.compile(r"### Example: (.+?)\n\n```json\n(.*?)```\n\n```hex\n(.*?)```", re.DOTALL)
@@ -59,6 +60,41 @@ def test_the_server_reads_the_example_of_a_command() -> None:
     assert command.rendered_tick == message["rendered_tick"]
 
 
+def test_the_examples_of_command_and_force_press_along_the_normal_of_the_frame_that_was_acquired() -> None:
+    frame = Frame(**EXAMPLES["Request to acquire"][0]["frame"])
+    (tool,) = EXAMPLES["Describe"][0]["tools"]
+    home = EXAMPLES["Answer to acquire"][0]["tools"]["tip"]["home_m"]
+    assert home == list(frame.point_at_client(tool["start_m"]))
+    normal = np.array(frame.direction_at_client(tool["normal"]))
+    command, force = EXAMPLES["Command"][0], EXAMPLES["Force"][0]
+    inwards = np.array(home) - command["position_m"]["tip"]
+    assert inwards @ normal > 0.001
+    np.testing.assert_allclose(inwards, (inwards @ normal) * normal, atol=1e-15)
+    assert np.array(command["velocity_m_per_s"]["tip"]) @ normal < 0
+    (rendered,) = force["force_n"]
+    assert np.array(rendered) @ normal > 0.9 * np.linalg.norm(rendered) > 0
+    assert (force["sequence"], force["client_time_ns"]) == (
+        [command["sequence"]],
+        [command["client_time_ns"]],
+    )
+    assert not force["flags"][0] & Flags.HELD
+    assert command["rendered_tick"] < force["tick"]
+    np.testing.assert_allclose(force["position_m"][0], command["position_m"]["tip"], atol=1e-4)
+
+
+def test_the_warnings_of_the_example_of_acquire_are_those_of_its_request() -> None:
+    request, described = EXAMPLES["Request to acquire"][0], EXAMPLES["Describe"][0]
+    stiffness = np.linalg.norm(described["model"]["instant_stiffness_n_per_m"], 2)
+    warnings = stiffness_warnings(
+        PROFILES[request["device"]],
+        float(stiffness) * request["frame"]["scale"] ** 2,
+        described["period_s"],
+        request["round_trip_s"],
+        request["device_damping_n_s_per_m"],
+    )
+    assert warnings == EXAMPLES["Answer to acquire"][0]["warnings"] != []
+
+
 def test_the_server_encodes_geometry_and_surface_as_in_the_examples() -> None:
     geometry, payload = EXAMPLES["Geometry"]
     vertices = np.frombuffer(geometry["vertices_m"], "<f4").reshape(-1, 3).astype(float)
@@ -72,8 +108,13 @@ def test_the_server_encodes_geometry_and_surface_as_in_the_examples() -> None:
 
 
 def test_the_client_reads_the_examples_of_force_and_describe() -> None:
-    force = force_of(EXAMPLES["Force"][0], 0, 5)
-    assert (force.sequence, force.force_n, force.arrival_ns) == (7, [0.0, 0.25, 0.0], 5)
+    message, payload = EXAMPLES["Force"]
+    force = force_of(unpack(payload, Kind.FORCE), 0, 5)
+    assert (force.sequence, force.force_n, force.arrival_ns) == (
+        message["sequence"][0],
+        message["force_n"][0],
+        5,
+    )
     description = read_description(EXAMPLES["Describe"][0])
     assert description.index("tip") == 0
     assert description.tools[0].normal == (0.0, -1.0, 0.0)

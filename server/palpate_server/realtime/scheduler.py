@@ -60,13 +60,6 @@ _PHASE_GAIN = 16
 REFUSALS = ("", "out_of_range", "not_finite", "old_sequence")
 _OUT_OF_RANGE, _NOT_FINITE, _OLD_SEQUENCE = -1, -2, -3
 
-_NO_CHANGE = int(Change.NONE)
-_LIMITS = int(Change.LIMITS)
-_FRAME = int(Change.FRAME)
-_RESET = int(Change.RESET)
-_EXCHANGE = int(Change.EXCHANGE)
-_SAVE = int(Change.SAVE)
-
 _eventfd_write: Any = types.ExternalFunction("eventfd_write", int32(int32, uint64))
 
 
@@ -143,7 +136,7 @@ def set_limits(image: Image, tool: int, limits: Floats) -> None:
     settings.max_speed_m_per_s = limits[2]
     settings.workspace_radius_m = limits[3]
     settings.max_damping_n_s_per_m = limits[4]
-    store_release(m.shared, CHANGE, _LIMITS)
+    store_release(m.shared, CHANGE, Change.LIMITS)
 
 
 @compiled
@@ -159,7 +152,7 @@ def set_frame(image: Image, tool: int, rotation: Floats, scale: float, home: Flo
         for j in range(3):
             settings.rotation[i, j] = rotation[i, j]
     settings.scale = scale
-    store_release(m.shared, CHANGE, _FRAME)
+    store_release(m.shared, CHANGE, Change.FRAME)
 
 
 @compiled
@@ -176,7 +169,7 @@ def reset(image: Image) -> None:
 
     A force that a device is rendering is not forgotten: it comes down at the allowed rate.
     """
-    store_release(view(image).shared, CHANGE, _RESET)
+    store_release(view(image).shared, CHANGE, Change.RESET)
 
 
 @compiled
@@ -184,19 +177,19 @@ def exchange(image: Image, replacement: Image) -> None:
     """Ask the loop to go on with another memory: the same one with another coupling."""
     m = view(image)
     m.changes.image[:] = replacement
-    store_release(m.shared, CHANGE, _EXCHANGE)
+    store_release(m.shared, CHANGE, Change.EXCHANGE)
 
 
 @compiled
 def save(image: Image) -> None:
     """Ask for the state to be saved."""
-    store_release(view(image).shared, CHANGE, _SAVE)
+    store_release(view(image).shared, CHANGE, Change.SAVE)
 
 
 @compiled
 def is_changed(image: Image) -> bool:
     """Whether the change that was asked for has been carried out."""
-    return load_acquire(view(image).shared, CHANGE) == _NO_CHANGE
+    return load_acquire(view(image).shared, CHANGE) == Change.NONE
 
 
 @compiled
@@ -204,7 +197,7 @@ def withdraw_change(image: Image) -> bool:
     """Take the change out of the slot again; False when a tick has taken it up already."""
     m = view(image)
     kind = load_acquire(m.shared, CHANGE)
-    return kind > _NO_CHANGE and compare_and_swap(m.shared, CHANGE, kind, _NO_CHANGE)
+    return kind > Change.NONE and compare_and_swap(m.shared, CHANGE, kind, Change.NONE)
 
 
 @compiled
@@ -215,28 +208,28 @@ def take_up_change(image: Image) -> None:
     """
     m = view(image)
     kind = load_acquire(m.shared, CHANGE)
-    if kind == _NO_CHANGE or not compare_and_swap(m.shared, CHANGE, kind, TAKEN):
+    if kind == Change.NONE or not compare_and_swap(m.shared, CHANGE, kind, TAKEN):
         return
     changes = m.changes
     tool = changes.port[0]
-    if kind == _LIMITS:
+    if kind == Change.LIMITS:
         m.settings[tool] = changes.settings[0]
-    elif kind == _FRAME:
+    elif kind == Change.FRAME:
         m.settings[tool] = changes.settings[0]
         for j in range(3):  # after a reset, though, the device is where it was
             m.ports[tool].device_m[j] = m.settings[tool].home_m[j]
         put_to_rest(m, tool)
-    elif kind == _RESET:
+    elif kind == Change.RESET:
         couplings.put_to_rest(m.coupling)
         for i in range(m.ports.shape[0]):
             m.ports[i].force_scale = 0.0
             put_to_rest(m, i)
-    elif kind == _EXCHANGE:
+    elif kind == Change.EXCHANGE:
         m.counters[0].quiet_ticks = 0
         image[:] = changes.image
     _save(view(image))
     m.ring.ticks[m.counters[0].ticks % RECORDS].change = kind
-    store_release(m.shared, CHANGE, _NO_CHANGE)
+    store_release(m.shared, CHANGE, Change.NONE)
 
 
 @compiled

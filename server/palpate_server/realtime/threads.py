@@ -10,18 +10,25 @@ import sys
 
 # Priorities of SCHED_FIFO (1 to 99), above ordinary threads and below the kernel's own. The thread that receives commands
 # runs ticks too: its priority is high, so that no ordinary thread can interrupt a tick that the loop has to wait for.
-# Zenoh's threads keep the links alive and carry the messages; they need little time, but need it within the lease.
+# Zenoh's threads keep the links alive and carry the messages; they need little time, but need it within the lease. The
+# threads that answer queries and send status and surface come last: while one of them holds the GIL and waits for a
+# processor, commands wait for the GIL.
 LOOP_PRIORITY = 80
 COMMAND_PRIORITY = 70
 ZENOH_PRIORITY = 5
+SERVICE_PRIORITY = 2
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # on fault: only pages that are used take memory
 _SWITCH_INTERVAL_S = 1e-4  # of Python threads
 
 
-def raise_priority(priority: int = LOOP_PRIORITY) -> str | None:
-    """Give the calling thread a priority of SCHED_FIFO. Threads that it starts inherit it. Returns why not, or None."""
+def raise_priority(priority: int = LOOP_PRIORITY, *, inherited: bool = False) -> str | None:
+    """Give the calling thread a priority of SCHED_FIFO. Returns why not, or None.
+
+    Threads and processes that it starts are of ordinary priority, unless `inherited`.
+    """
+    policy = os.SCHED_FIFO if inherited else os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
     except OSError as error:
         return (
             f"no real-time scheduling ({error.strerror}): expect late ticks on a busy machine; "

@@ -15,9 +15,10 @@ import io
 import json
 import math
 import os
+import resource
 import signal
 import sys
-from typing import Any
+from typing import IO, Any
 
 import msgpack
 import numpy as np
@@ -64,43 +65,13 @@ _SCHEMAS: dict[str, dict[str, Any]] = {
 }
 
 
-class _File:
-    """A file that keeps within a number of bytes."""
-
-    def __init__(self, descriptor: int, max_bytes: int) -> None:
-        self._file = io.FileIO(descriptor, "wb", closefd=False)
-        self._max_bytes = max_bytes
-        self.size = 0
-
-    def write(self, data: bytes) -> int:
-        """Raises OSError."""
-        if self.size + len(data) > self._max_bytes:
-            raise OSError(None, FULL)
-        view = memoryview(data)
-        while view:
-            view = view[self._file.write(view) or 0 :]
-        self.size += len(data)
-        return len(data)
-
-    def cut(self, size: int) -> None:
-        """Take away what stands behind `size` bytes."""
-        with contextlib.suppress(OSError):  # what is no plain file can't be cut
-            os.ftruncate(self._file.fileno(), size)
-
-    def tell(self) -> int:
-        return self.size
-
-    def flush(self) -> None:
-        pass
-
-
 class Recording:
     """An MCAP file that is being written; one channel a key, its schema named after the kind of message.
 
     messages: how many are in the file for good, in its first `end` bytes
     """
 
-    def __init__(self, file: Any) -> None:
+    def __init__(self, file: IO[bytes]) -> None:
         self._file = file
         self._writer = Writer(
             file, chunk_size=_CHUNK_BYTES, compression=CompressionType.LZ4, enable_data_crcs=True
@@ -130,6 +101,7 @@ class Recording:
         self._writer.add_message(self._channels[key], log_time=time_ns, data=data, publish_time=time_ns)
         self._added += 1
         if self._file.tell() > size:  # a chunk was written, this message its last
+            self._file.flush()
             self.messages, self.end = self._added, self._file.tell()
 
     def add_ticks(self, key: str, clock_offset_ns: int, ticks: bytes, ports: bytes) -> None:
@@ -142,6 +114,7 @@ class Recording:
             self.add("tick", key, tick["start_ns"] + clock_offset_ns, tick)
 
     def finish(self) -> None:
+        """Write the rest. Raises OSError."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         self.messages = self._added
 
@@ -161,7 +134,7 @@ def _tell(what: object) -> None:
         print(what, file=sys.stderr, flush=True)
 
 
-def _write_all(recording: Recording, file: _File, max_bytes: int) -> str | None:
+def _write_all(recording: Recording, file: IO[bytes], max_bytes: int) -> str | None:
     """Write what comes through the pipe until its end; why the recording has ended before, if it has."""
     told = 0
     # Unbuffered: a buffered one would wait for a megabyte, which is seconds of ticks.
@@ -174,7 +147,7 @@ def _write_all(recording: Recording, file: _File, max_bytes: int) -> str | None:
         if recording.messages > told:
             told = recording.messages
             _tell(told)
-        if file.size > max_bytes - 2 * _CHUNK_BYTES - _END_BYTES:
+        if file.tell() > max_bytes - 2 * _CHUNK_BYTES - _END_BYTES:
             return FULL
     return None
 
@@ -186,19 +159,24 @@ def main() -> int:
     # The server comes first. At 10, a busy machine would leave less than a thousand ticks a second need: some percent.
     os.nice(5)
     max_bytes = int(sys.argv[1])
-    file = _File(sys.stdout.fileno(), max_bytes)
+    limit, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if (
+        limit == resource.RLIM_INFINITY or limit > max_bytes
+    ):  # for messages that are larger than the room at the end
+        resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, hard))
+    file = open(sys.stdout.fileno(), "wb", closefd=False)  # noqa: SIM115, it is closed with the process
     error: str | None
-    recording = None
+    recording = Recording(file)
     try:
-        recording = Recording(file)
         error = _write_all(recording, file, max_bytes)
         recording.finish()
+        file.flush()
         _tell(recording.messages)
     except OSError as failure:
         error = failure.strerror
-        if recording is not None:
-            file.cut(recording.end)
-            _tell(recording.messages)
+        with contextlib.suppress(OSError):  # what is no plain file can't be cut
+            os.ftruncate(file.fileno(), recording.end)
+        _tell(recording.messages)
     if error is not None:
         _tell(error)
         os._exit(1)  # without another try, on the way out, to write what can't be written

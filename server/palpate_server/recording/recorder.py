@@ -138,11 +138,11 @@ class Recorder:
     def _run(self) -> None:
         try:
             while not self._ending.wait(PERIOD_S):
-                self._collect()
+                self.collect()
                 self._write(PERIOD_S)
                 if len(self._unwritten) > MAX_UNWRITTEN_BYTES:
                     raise _EndedEarlyError(_TOO_SLOW)
-            self._collect()
+            self.collect()
             self._finish()
         except Exception as error:  # whatever it was: the recording is over, and says so
             self.error = str(error)
@@ -151,8 +151,8 @@ class Recorder:
             self._close_pipe()
             self._process.poll()
 
-    def _collect(self) -> None:
-        """Take what is new. Settings stand before the first tick with them."""
+    def collect(self) -> None:
+        """Take what is new out of the ring; its thread does each PERIOD_S. Settings stand before the first tick with them."""
         while not self._told.empty():
             kind, tick, payload = self._told.get_nowait()
             if kind == "settings":

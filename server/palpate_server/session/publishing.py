@@ -103,6 +103,7 @@ class SurfacePublisher:
 
     def run(self) -> None:
         """Until the session stops."""
+        threads.raise_priority(threads.SERVICE_PRIORITY)
         state = self._state
         due_s = time.monotonic()
         while not state.stopping.wait(max(0.0, due_s - time.monotonic())):

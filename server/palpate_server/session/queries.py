@@ -22,6 +22,7 @@ from palpate_client.wire import (
     last_chunk,
     pack,
 )
+from palpate_server.realtime import threads
 from palpate_server.session.fields import read_request
 from palpate_server.session.leases import Refused
 from palpate_server.session.requests import Requests
@@ -97,6 +98,7 @@ class Queries:
 
     def run(self) -> None:
         """Serve one event after another, until `end`."""
+        threads.raise_priority(threads.SERVICE_PRIORITY)  # not allowed: the loop's thread has said so
         urgency = _QUERIES
         while urgency != _END:
             urgency, _, event = self._events.get()

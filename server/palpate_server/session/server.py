@@ -185,6 +185,7 @@ def serve(
     """Serve a model until `stop` is set."""
     server = Server(model, session, keys, options)
     server.start()
+    threads.raise_priority(threads.SERVICE_PRIORITY)
     try:
         on_ready()
         while not stop.wait(STATUS_PERIOD_S):

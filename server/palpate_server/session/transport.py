@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +44,13 @@ def open_session(listen: str | None, config_file: Path | None) -> zenoh.Session:
 
     Zenoh's own threads get a low real-time priority where that is allowed: they inherit it from the thread that opens the
     first session of a process. Threads that call back into Python inherit from the thread that declares, so Python's
-    work stays at ordinary priority.
+    threads get the priority that they ask for.
 
     Raises TransportError when the file can't be read, or the endpoint is malformed or in use.
     """
     endpoint = listen or DEFAULT_ENDPOINT
-    with ThreadPoolExecutor(1, "open", threads.raise_priority, (threads.ZENOH_PRIORITY,)) as opener:
+    prepare = partial(threads.raise_priority, threads.ZENOH_PRIORITY, inherited=True)
+    with ThreadPoolExecutor(1, "open", prepare) as opener:
         return opener.submit(_open, endpoint, config_file).result()
 
 

@@ -81,9 +81,9 @@ def test_ticks_that_were_overwritten_before_they_were_taken_are_counted_and_a_ne
 ) -> None:
     monkeypatch.setattr(recorder, "PERIOD_S", 1e6)  # it looks once, at the end
     recording = loop.record(tmp_path / "a.mcap")
-    recording._collect()  # the first state
+    recording.collect()  # the first state
     loop.run(RECORDS + 99)
-    recording._collect()
+    recording.collect()
     loop.run(10)
     recording.stop()
     # One more than the 99: the oldest row is the one that the next tick writes to.

@@ -125,7 +125,7 @@ def test_a_recording_longer_than_the_ring_repeats(loop: Loop, tmp_path: Path) ->
     recording = loop.record(path)
     for _ in range(3):
         loop.run(RECORDS // 2)
-        recording._collect()  # in time, however busy the machine
+        recording.collect()  # in time, however busy the machine
     recorded = finished(loop, path)
     assert replay.compare(recorded, [loop.model]) == everything(recorded)
 
