@@ -145,7 +145,6 @@ def test_a_real_server_answers_in_the_form_of_the_examples(
         "reset": {},
         "load": {"file": "model1.npz"},
         "record": {},
-        "release": {},
     }
     with connect(served.endpoint) as client:
         _shape_but_model(client.query("describe")[1], EXAMPLES["Describe"][0])
@@ -160,6 +159,9 @@ def test_a_real_server_answers_in_the_form_of_the_examples(
         )
         assert granted
         _shape(answer, EXAMPLES["Answer to record"][0])
+        granted, answer = client.query(f"control/{client.name}/release", EXAMPLES["Request to release"][0])
+        assert granted
+        _shape(answer, EXAMPLES["Answer to release"][0])
         granted, answer = client.query(f"control/{client.name}/reset", EXAMPLES["Request to reset"][0])
         assert not granted
         _shape(answer, EXAMPLES["Refusal"][0])
