@@ -6,7 +6,7 @@ Keys, kinds, reasons and bounds are those of `palpate_client.wire`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import msgpack
 import numpy as np
@@ -20,9 +20,8 @@ from palpate_client.wire import (
     SCHEMA_VERSION,
     Kind,
     MalformedMessage,
-    check_kind,
     pack,
-    unpack_map,
+    unpack,
 )
 from palpate_server.realtime.compiled import compiled
 from palpate_server.realtime.records import PORT_RECORD
@@ -58,12 +57,7 @@ def decode_command(payload: bytes) -> Command:
 
     Unknown fields are ignored, so that the schema can grow. None in an optional field is the same as the field left out.
     """
-    return read_command(unpack_map(payload, MAX_COMMAND_BYTES))
-
-
-def read_command(message: Mapping[str, Any]) -> Command:
-    """The command in a decoded map. Raises MalformedMessage."""
-    check_kind(message, Kind.COMMAND)
+    message = unpack(payload, Kind.COMMAND, MAX_COMMAND_BYTES)
     try:
         sequence, client_time_ns = message["sequence"], message["client_time_ns"]
         position = _vectors("position_m", message["position_m"])
@@ -79,9 +73,8 @@ def read_command(message: Mapping[str, Any]) -> Command:
     _check_integer("sequence", sequence)
     _check_integer("client_time_ns", client_time_ns)
     if (rendered_tick := message.get("rendered_tick")) is None:
-        rendered_tick = -1
-    else:
-        _check_integer("rendered_tick", rendered_tick)
+        return Command(sequence, client_time_ns, position, velocity)
+    _check_integer("rendered_tick", rendered_tick)
     return Command(sequence, client_time_ns, position, velocity, rendered_tick)
 
 

@@ -24,6 +24,7 @@ from pathlib import Path
 
 import zenoh
 
+import palpate_server.session.server  # noqa: F401, runs in other processes: what it lacks is said at the start
 from palpate.model_file import save_model
 from palpate_client.arguments import positive
 from palpate_client.connection import open_session

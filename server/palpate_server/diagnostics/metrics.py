@@ -54,12 +54,8 @@ class StatusCollector(Collector):
             return
         for name, text in _COUNTERS.items():
             yield CounterMetricFamily(f"palpate_{name}", text, value=status[name])
-        for kind, what in (
-            ("refused", "commands"),
-            ("malformed", "commands"),
-            ("dropped", "commands and forces"),
-        ):
-            family = CounterMetricFamily(f"palpate_{kind}", f"{what} {kind}, by reason", labels=["reason"])
+        for kind in ("refused", "malformed", "dropped"):
+            family = CounterMetricFamily(f"palpate_{kind}", f"messages {kind}, by reason", labels=["reason"])
             for reason, count in status[kind].items():
                 family.add_metric([reason], count)
             yield family

@@ -59,5 +59,5 @@ def monotonic_ns() -> int:
 
 @compiled_without_gil
 def sleep_until(deadline_ns: int) -> None:
-    """Sleep until the monotonic clock shows `deadline_ns`; returns at once when that is past, early on a signal."""
+    """Sleep until `deadline_ns` on the monotonic clock. Returns at once if that is past, and early on a signal."""
     _clock_nanosleep(deadline_ns)

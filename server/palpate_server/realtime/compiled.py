@@ -37,8 +37,8 @@ def compiled_without_gil(function: Function) -> Function:
 class _Cache(FunctionCache):
     """numba's cache on disk, under names that change as soon as any file with compiled functions does.
 
-    numba looks at the function's own file alone, though what it stores has the functions of other files in it. And it
-    reads what is out of date before it finds that out, which fails where a type has moved: so not the stamp, the name.
+    numba looks at the function's own file alone, although what it stores contains functions of other files. It also reads
+    an entry before it finds that the entry is out of date, which fails where a type has moved. So the name changes.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -64,9 +64,7 @@ def _compile(function: Function, *, nogil: bool) -> Function:
     dispatcher: Any = njit(nogil=nogil)(function)
     try:
         dispatcher._cache = _Cache(function)
-    except (
-        RuntimeError
-    ) as error:  # no cache directory is writable: a read-only container, another user's files
+    except RuntimeError as error:  # no writable directory: a read-only container, another user's files
         warnings.warn(
             f"compiled functions are not cached, every start takes seconds longer ({error}); "
             "point NUMBA_CACHE_DIR to a writable directory",

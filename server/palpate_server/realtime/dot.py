@@ -1,7 +1,7 @@
-"""A dot product for compiled code that is fast and always rounds the same: with vectors, but the sums in one stated order.
+"""A vectorized dot product for compiled code that sums in one stated order, so that it always rounds the same.
 
-A compiler that may reorder sums vectorizes them too, but in an order of its own, which is another in another caller, after
-another start or on another processor. A replay that compares bit for bit can't live with that.
+A compiler that may reorder sums vectorizes them too, but its order differs between callers, between compilations and between
+processors. A replay compares bit for bit, so the order has to be fixed.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, call-arg, arg-type"
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-LANES = 16  # numbers at a time: the vectors of every processor divide it
+LANES = 16  # numbers at a time: a multiple of the vector width of every processor
 
 _DOUBLE, _INT32 = ir.DoubleType(), ir.IntType(32)
 
@@ -79,8 +79,8 @@ def _dot(typing_context, first, second):
 
 
 dot = cast(Callable[[Floats, Floats], float], _dot)
-"""sum_i first[i] second[i] of two vectors (n,), each in one piece; for compiled code alone.
+"""sum_i first[i] second[i] of two contiguous vectors (n,); for compiled code alone.
 
-The order: LANES sums, of every LANES-th product each; their upper half added to the lower one until one is left; then the
-last n % LANES products one by one. Every product and every sum is rounded to float64.
+Order: LANES partial sums, each of every LANES-th product. Then the upper half of the sums is added to the lower half until one
+sum is left. Then the last n % LANES products are added one by one. Every product and every sum is rounded to float64.
 """

@@ -1,7 +1,7 @@
-"""Hand a named tuple of arrays to compiled code as one array: its native image, unboxed once instead of at every call.
+"""The native image of a named tuple of arrays: one array that compiled code takes instead of the tuple.
 
-Unboxing some thirty arrays costs 5 microseconds; unboxing one costs a tenth of one. The image is an array of words whose
-one field bears the name of the tuple's type, so that compiled code is compiled for that type.
+To unbox some thirty arrays at every call costs 5 microseconds; to unbox one costs 0.1. The image is an array of words. Its one
+field has the name of the tuple's type, so that functions are compiled for that type.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, call-arg, arg-type, override"
@@ -25,17 +25,17 @@ _TYPES: dict[str, types.Type] = {}
 
 
 def register(name: str, example: tuple[Any, ...]) -> None:
-    """Have images of tuples like `example` be made and viewed, under a name of their own."""
+    """Allow images of tuples of the same type as `example`, and give the type a name."""
     _TYPES[name] = typeof(example)
 
 
 def empty_image(name: str) -> Image:
-    """An array to copy images of the type of this name into."""
+    """Room for an image of the type with this name."""
     return np.zeros(WORDS, np.dtype([(name, np.int64)]))
 
 
 def _borrowed(context, builder, numba_type, value):
-    """The same arrays without an owner to count references on: whoever made the image keeps them alive."""
+    """The same arrays without reference counts: the maker of the image keeps them alive."""
     if isinstance(numba_type, types.Array):
         array = context.make_array(numba_type)(context, builder, value)
         array.meminfo = cgutils.get_null_value(array.meminfo.type)
@@ -47,22 +47,16 @@ def _borrowed(context, builder, numba_type, value):
     return value
 
 
-def _pointer_to(context, builder, buffer_type, buffer, numba_type):
-    data = context.make_array(buffer_type)(context, builder, buffer).data
-    return builder.bitcast(data, context.get_value_type(numba_type).as_pointer())
-
-
 @intrinsic
 def _store(typing_context, buffer, value):
     def codegen(context, builder, signature, args):
-        native = context.get_value_type(signature.args[1])
+        buffer_type, tuple_type = signature.args
+        native = context.get_value_type(tuple_type)
         if context.get_abi_sizeof(native) > 8 * WORDS:
             raise ValueError("the tuple is larger than its image may be")
-        builder.store(
-            _borrowed(context, builder, signature.args[1], args[1]),
-            _pointer_to(context, builder, signature.args[0], args[0], signature.args[1]),
-            align=8,
-        )
+        data = context.make_array(buffer_type)(context, builder, args[0]).data
+        pointer = builder.bitcast(data, native.as_pointer())
+        builder.store(_borrowed(context, builder, tuple_type, args[1]), pointer, align=8)
         return context.get_dummy_value()
 
     return types.void(buffer, value), codegen
@@ -88,10 +82,9 @@ def make_image(arrays: tuple[Any, ...]) -> Image:
 
 
 class ViewType(types.Type):
-    """A named tuple in an image, by its address: a field is loaded when it is asked for, and a tuple in it is a view again.
+    """The address of a named tuple in an image. A field is loaded when it is read; a tuple in it is a view again.
 
-    A whole tuple as a value would be some three hundred arguments of every function that it is handed to, which takes
-    minutes to compile.
+    As a value, the tuple would be some three hundred arguments of every function that takes it: minutes to compile.
     """
 
     def __init__(self, tuple_type: types.BaseNamedTuple) -> None:

@@ -60,11 +60,9 @@ class BlackBox:
         cause = self._cause(first, head, lost_clients)
         self._seen = head
         now = time.monotonic()
-        if (
-            cause is None
-            or now - self._last_file_s.get(cause, -np.inf) < QUIET_S
-            or self._files == MOST_FILES
-        ):
+        if cause is None or self._files == MOST_FILES:
+            return None
+        if now - self._last_file_s.get(cause, -np.inf) < QUIET_S:
             return None
         self._files += 1
         if self._files == MOST_FILES:
@@ -75,7 +73,7 @@ class BlackBox:
         return thread
 
     def _cause(self, first: int, head: int, lost_clients: int) -> str | None:
-        flags = self._flags(first, head)
+        flags = self._column("flags", first, head)
         if np.any(flags & int(Flags.FAULT)):
             return "fault"
         was_lost, self._lost_clients = self._lost_clients > self._lost_written, lost_clients
@@ -84,17 +82,14 @@ class BlackBox:
             return "lost"
         if first == head:
             return None
-        before = self._flags(first - 1, head - 1) if first else np.full_like(flags, int(Flags.STALE))
+        before = self._column("flags", first - 1, head - 1) if first else np.full_like(flags, Flags.STALE)
         became_stale = (flags & int(Flags.STALE) > 0) & (before & int(Flags.DECAYING) > 0)
         if np.any(became_stale & (self._column("sequence", first, head) >= 0)):  # not one that was released
             return "stale"
-        recent = self._flags(max(0, head - STORM_TICKS), head)
+        recent = self._column("flags", max(0, head - STORM_TICKS), head)
         if len(recent) == STORM_TICKS and np.mean(np.any(recent & _LIMITED, axis=1)) >= STORM_SHARE:
             return "limits"
         return None
-
-    def _flags(self, first: int, last: int) -> Integers:
-        return self._column("flags", first, last)
 
     def _column(self, name: str, first: int, last: int) -> Integers:
         """(ticks, n_tools)"""

@@ -33,8 +33,8 @@ class ForcePublisher:
         self._wake = wake
         self._sending = threading.Lock()
         self._encoder = wire.ForceEncoder(len(state.tools))
-        self._ticks, ports = state.memory.ring  # stays the same when the model is exchanged
-        self._ports = wire.as_words(ports)
+        ring = state.memory.ring  # stays the same when the model is exchanged
+        self._start_ns, self._ports = ring.ticks["start_ns"], wire.as_words(ring.ports)
         self._sent = 0
         self._publisher = _publisher(session, state.keys.force, zenoh.Priority.REAL_TIME, express=True)
 
@@ -62,8 +62,8 @@ class ForcePublisher:
                 self._sent = head - MAX_UNSENT
             while self._sent < head:
                 row = self._sent % RECORDS
-                start_ns = int(self._ticks["start_ns"][row])
-                self._publisher.put(self._encoder.encode(self._sent, start_ns, self._ports[row]))
+                message = self._encoder.encode(self._sent, self._start_ns[row], self._ports[row])
+                self._publisher.put(message)
                 self._sent += 1
         finally:
             self._sending.release()
