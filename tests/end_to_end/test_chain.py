@@ -17,6 +17,7 @@ from palpate.lti.stepping import step_through
 from palpate.model_file import ReducedModel, load_model
 from palpate.plots import Touch
 from palpate_client.local_server import free_endpoint
+from palpate_client.wire import RECORDER
 
 Array = NDArray[np.float64]
 
@@ -58,7 +59,7 @@ def poke(
     endpoint = free_endpoint()
     place = ("--session", "chain", "--listen", endpoint)
     server = palpate("serve", "slab.npz", *place, "--recordings", ".", ready="serving slab")
-    with connect(endpoint, server="chain") as client:
+    with connect(endpoint, server="chain", name=RECORDER) as client:
         client.record("poke.mcap")
         place = ("--session", "chain", "--connect", endpoint, "--silence-s", "30")
         motion = ("--tool", "right", "--amplitude-m", "0.002", "--frequency-hz", "2", "--duration-s", "2")

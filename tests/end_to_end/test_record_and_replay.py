@@ -17,6 +17,7 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from palpate.model_file import ReducedModel, save_model
+from palpate_client.wire import RECORDER
 from palpate_server.recording import replay
 
 
@@ -139,6 +140,9 @@ def test_recordings_are_refused_with_a_reason(
 
     served = serve("--recordings", str(tmp_path / "new"), "--max-recordings-gb", "0.003")
     with connect(served.endpoint) as client:
+        for file in ("a.mcap", None):
+            assert refusal(client, file=file) == "not_holder"
+        assert client.acquire("tip")[0]
         client.record("a.mcap")
         assert refusal(client, file="b.mcap") == "busy"
         client.status_when(lambda status: status["recording"]["messages"] > 100, "some messages")
@@ -173,7 +177,7 @@ def test_a_server_that_ends_while_it_records_leaves_a_complete_file(
 ) -> None:
     served = serve("--recordings", str(tmp_path))
     path = tmp_path / "a.mcap"
-    with connect(served.endpoint) as client:
+    with connect(served.endpoint, name=RECORDER) as client:
         client.record("a.mcap")
         run_example("palpate_client.poke", served.endpoint, "--duration-s", "60")
         client.force_when(lambda force: force["force_scale"][0] == 1.0, "the force in full")
@@ -192,7 +196,7 @@ def test_a_full_disk_ends_a_recording_not_the_server(
     serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
 ) -> None:
     served = serve("--recordings", str(tmp_path))
-    with connect(served.endpoint) as client:
+    with connect(served.endpoint, name=RECORDER) as client:
         limit_files(served.process, 200_000)  # the process that writes inherits it
         assert client.control("record", file="full.mcap")[0]
         limit_files(served.process)

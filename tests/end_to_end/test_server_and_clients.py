@@ -27,7 +27,7 @@ import pytest
 
 from palpate.model_file import save_model
 from palpate_client.local_server import free_endpoint
-from palpate_client.wire import Flags
+from palpate_client.wire import RECORDER, Flags
 from palpate_server.diagnostics.sample_model import spring_mass_model
 
 LIMITS_MET = int(
@@ -62,7 +62,7 @@ def test_forces_through_the_wire_are_the_tissues_answer_to_the_applied_positions
         *("--recordings", str(tmp_path)),
     )
     heard = tmp_path / "ticks.csv"
-    with connect(served.endpoint) as client:
+    with connect(served.endpoint, name=RECORDER) as client:
         client.record("ticks.mcap")
         options = ("--duration-s", "2", "--json", "--record", str(heard))
         code, out, err = run_example("palpate_client.poke", served.endpoint, *options).finish()
@@ -138,7 +138,7 @@ def test_a_client_that_pauses_for_half_a_second_is_faded_out_and_softly_in_again
 ) -> None:
     served = serve("--recordings", str(tmp_path))
     slow = ("--duration-s", "60", "--frequency-hz", "0.5")
-    with connect(served.endpoint) as observer:
+    with connect(served.endpoint, name=RECORDER) as observer:
         client = run_example("palpate_client.poke", served.endpoint, *slow)
         observer.force_when(in_full, "the force in full")
         assert observer.control("record", file="pause.mcap")[0]

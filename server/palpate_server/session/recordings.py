@@ -35,10 +35,10 @@ class Recordings:
 
         For clients that hold a tool, and for the one whose name is RECORDER: nobody else can fill the folder.
         """
-        if client != RECORDER:
-            self._state.leases.check_holder(client)
         if self._folder is None:
             raise Refused("no_recordings", "the server was started without a folder for recordings")
+        if client != RECORDER:
+            self._state.leases.check_holder(client)
         if not self._changing.acquire(blocking=False):
             raise Refused("busy", "a recording is being started or ended")
         try:
