@@ -39,6 +39,7 @@ CONTENDERS = ("palpate", "SLICOT", "pyMOR dense", "pyMOR low-rank")
 def cube(counts: tuple[int, int, int]) -> dict[str, Array]:
     """Mass-normalized stiffness blocks of the paper's cube (section 4.2), its contact the nodes at the top center."""
     from palpate.discretization import conservative
+    from palpate.discretization.supports import components
     from palpate.geometry.shapes import box_lattice
     from palpate.modes.dense import elastic_modes
     from palpate.scene.material import PRESETS
@@ -48,10 +49,11 @@ def cube(counts: tuple[int, int, int]) -> dict[str, Array]:
     bottom = np.flatnonzero(cloud.points[:, 2] < 1e-9)
     distance = np.linalg.norm(cloud.points - (0.5, 0.5, 1.0), axis=1)
     tip = np.flatnonzero(distance < distance.min() + 1e-9)
-    modes = elastic_modes(conservative.assemble(cloud, material, bottom, [tip]))
-    free = np.flatnonzero(np.any(modes.shapes != 0, axis=1))
+    body = conservative.assemble(cloud, material, bottom, [tip])
+    modes = elastic_modes(body)
+    free = components(body.supports.free, 3)
     root_mass = np.repeat((material.density_kg_per_m3 * cloud.volumes) ** 0.5, 3)[free]
-    vectors = root_mass[:, None] * modes.shapes[free]  # orthonormal
+    vectors = root_mass[:, None] * body.basis.values(modes.parameters)[free]  # orthonormal
     return {
         "stiffness": (vectors * modes.squared_frequencies) @ vectors.T,
         "coupling": vectors @ modes.input_coupling,

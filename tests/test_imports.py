@@ -51,6 +51,7 @@ ROOMS = (
     "scene",
     "geometry",
     "scene_cloud",
+    "factorization",
     "meshfree",
     "discretization",
     "modes",

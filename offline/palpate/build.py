@@ -148,13 +148,12 @@ def _surface(
 ) -> tuple[Surface, float]:
     """The surface that is shown with its read-out of the discrete model, and its error in the band, a fraction."""
     progress("surface")
-    shown = shown_surface(config, full.cloud)
-    operator = full.body.basis.at(shown.vertices)
+    shown, basis = shown_surface(config, full.cloud), full.body.basis
     fitted = fit_surface_output(
         full.modes,
         full.material.prony,
-        _at_vertices(operator, full.modes.shapes),
-        _at_vertices(operator, full.modes.patch_shapes),
+        basis.values_at(shown.vertices, full.modes.parameters),
+        basis.values_at(shown.vertices, full.modes.patch_parameters),
         discrete,
         period_s=config.reduction.period_s,
         band_hz=config.reduction.band_hz,
@@ -162,12 +161,6 @@ def _surface(
     progress.note(f"{len(shown.vertices):,} vertices")
     surface = Surface(shown.vertices, shown.triangles, fitted.output, fitted.feedthrough)
     return surface, fitted.error_in_band
-
-
-def _at_vertices(operator: Array, nodal: NDArray) -> NDArray:  # type: ignore[type-arg]
-    """(3 n_vertices, k): the operator (n_vertices, n_nodes) on each component of nodal values (3 n_nodes, k)."""
-    by_node = nodal.reshape(operator.shape[1], -1)
-    return (operator @ by_node).reshape(3 * len(operator), -1)
 
 
 def _contact(name: str, patch: ContactPatch) -> Contact:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.discretization import collocation, conservative
+from palpate.discretization.assembled_body import AssembledBody
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.shapes import box_lattice
 from palpate.geometry.tributary import tributary_measures
@@ -156,9 +157,11 @@ def membrane_errors(
             over_time = float(np.sqrt(difference.sum() / norm.sum()))
             errors.append(Error(method, cloud.n_nodes, at_time, over_time))
 
-        for method, modes in _meshfree(cloud):
-            load = spot_load.modal_load(modes.shapes, pressure)
-            add(method, deflections(modes.squared_frequencies, modes.shapes, load, prony))
+        for method, body in _meshfree(cloud):
+            modes = elastic_modes(body)
+            shapes = body.basis.values(modes.parameters)
+            load = spot_load.modal_load(shapes, pressure)
+            add(method, deflections(modes.squared_frequencies, shapes, load, prony))
         elements = finite_element_fields.membrane_modes(cloud.points, cloud.on_edge, middle, spot_radius)
         add("linear finite elements", deflections(*elements, prony))
     return errors
@@ -204,9 +207,11 @@ def cube_errors(counts: Sequence[int], reference_elements: int) -> list[Error]:
             ("conservative", conservative.assemble),
             ("collocation, linear", collocation.assemble),
         ):
-            modes = elastic_modes(assemble(cloud, CUBE_MATERIAL, fixed, tips))
+            body = assemble(cloud, CUBE_MATERIAL, fixed, tips)
+            modes = elastic_modes(body)
             for i, omega in enumerate(omegas):
-                add(method, i, harmonic_field(modes, omega, motion.ravel()).reshape(-1, 3))
+                parameters = harmonic_field(modes, omega, motion.ravel())
+                add(method, i, body.basis.values(parameters).reshape(-1, 3))
         for i, omega in enumerate(omegas):
             _, field = finite_element_fields.cube_of_tetrahedra(n, CUBE_MATERIAL, omega, _pressed_top)
             ordered = np.empty_like(field)
@@ -221,10 +226,10 @@ def _lexicographic(points: Array) -> NDArray[np.intp]:
 
 
 def harmonic_field(modes: ElasticModes, omega: float, motion: Array) -> Complex:
-    """(3 n_nodes,): complex displacements under tip displacements motion (n_inputs,) times e^{j omega t}."""
+    """(3 n_nodes,): parameters of the complex displacements under tip displacements motion (n_inputs,) times e^{j omega t}."""
     h = CUBE_MATERIAL.prony.transfer_factor(np.array([1j * omega]))[0]
     q = -h * (modes.input_coupling @ motion) / (h * modes.squared_frequencies - omega**2)
-    return np.asarray(modes.shapes @ q + modes.patch_shapes @ motion, dtype=np.complex128)
+    return np.asarray(modes.parameters @ q + modes.patch_parameters @ motion, dtype=np.complex128)
 
 
 def _pressed_top(x: Array, y: Array) -> Array:
@@ -232,11 +237,11 @@ def _pressed_top(x: Array, y: Array) -> Array:
     return np.clip(1 - ((x - 0.5) ** 2 + (y - 0.5) ** 2) / CUBE_SPOT**2, 0, None) ** 2
 
 
-def _meshfree(cloud: Membrane) -> list[tuple[str, ElasticModes]]:
+def _meshfree(cloud: Membrane) -> list[tuple[str, AssembledBody]]:
     return [
-        ("conservative", elastic_modes(membrane.conservative(cloud))),
-        ("collocation, linear", elastic_modes(membrane.collocation(cloud, order=1))),
-        ("collocation, quadratic", elastic_modes(membrane.collocation(cloud, order=2))),
+        ("conservative", membrane.conservative(cloud)),
+        ("collocation, linear", membrane.collocation(cloud, order=1)),
+        ("collocation, quadratic", membrane.collocation(cloud, order=2)),
     ]
 
 

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import bsr_array, csr_array, diags_array
 from scipy.spatial import cKDTree
 
+from palpate.factorization import factorize
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.measures import triangle_normals
 from palpate.geometry.sampling import sample_elements
@@ -58,25 +58,43 @@ def consistent_gradient(
         (scale[:, None, None] * inverse_moments, np.arange(n), np.arange(n + 1)), shape=(terms * n, terms * n)
     )
     diagonal = np.bincount(other, weight * scale[node], minlength=n)
-    normal = (diags_array(diagonal) - fit.T @ (inner @ fit)).toarray(order="F")
     # Scaled to a unit diagonal, which on graded clouds spans many powers of ten.
-    root = np.sqrt(diagonal)
-    normal /= root[:, None]
-    normal /= root
-    # Linear fields need no correction: they are the null space, and no defect has a part along them.
-    null, _ = np.linalg.qr(root[:, None] * np.column_stack([np.ones(n), points - points.mean(axis=0)]))
-    normal += null @ null.T
-    factor = cho_factor(normal, overwrite_a=True, check_finite=False)
+    inverse_root = diags_array(diagonal**-0.5)
+    normal = inverse_root @ (diags_array(diagonal) - fit.T @ (inner @ fit)) @ inverse_root
+    # Linear fields need no correction: they are the null space. A defect without a part along them has multipliers that
+    # are zero at nodes which fix a linear field, and a 1 on the diagonal there finds these.
+    null, _ = np.linalg.qr(
+        np.sqrt(diagonal)[:, None] * np.column_stack([np.ones(n), points - points.mean(axis=0)])
+    )
+    pinned = np.zeros(n)
+    pinned[_far_apart(points)] = 1
+    factor = factorize(csr_array(normal + diags_array(pinned)))
 
     target = h.value.T @ boundary
-    corrected = []
-    for axis, plain in enumerate(h.gradient):
-        defect = target[:, axis] - plain.T @ volumes
-        xi = cho_solve(factor, defect / root, check_finite=False) / root
-        fitted = (inverse_moments @ (fit @ xi).reshape(n, terms, 1))[:, :, 0]
-        change = weight * share[node] * (xi[other] - np.sum(linear * fitted[node], axis=1))
-        corrected.append(csr_array((plain.data + change, plain.indices, plain.indptr), shape=plain.shape))
+    corrected = list(h.gradient)
+    for _ in range(2):  # the second time for the round-off of the first, which grows with the cloud's grading
+        defect = target - np.column_stack([derivative.T @ volumes for derivative in corrected])
+        scaled = inverse_root @ defect
+        multipliers = inverse_root @ factor.solve(scaled - null @ (null.T @ scaled))
+        for axis, xi in enumerate(multipliers.T):
+            fitted = (inverse_moments @ (fit @ xi).reshape(n, terms, 1))[:, :, 0]
+            change = weight * share[node] * (xi[other] - np.sum(linear * fitted[node], axis=1))
+            data = corrected[axis].data + change
+            corrected[axis] = csr_array((data, other, h.value.indptr), shape=h.value.shape)
     return corrected
+
+
+def _far_apart(points: Array) -> list[int]:
+    """1 + dim nodes, each the farthest from the point, line or plane through those before: they fix a linear field."""
+    offset = points - points.mean(axis=0)
+    chosen = [int(np.argmax(np.linalg.norm(offset, axis=1)))]
+    offset = points - points[chosen[0]]
+    for _ in range(points.shape[1]):
+        distance = np.linalg.norm(offset, axis=1)
+        chosen.append(int(np.argmax(distance)))
+        direction = offset[chosen[-1]] / distance[chosen[-1]]
+        offset = offset - np.outer(offset @ direction, direction)
+    return chosen
 
 
 def vector_areas(cloud: NodeCloud) -> Array:

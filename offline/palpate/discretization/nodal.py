@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lu_factor, lu_solve
 from scipy.sparse import csr_array
+from scipy.sparse.linalg import SuperLU, splu
 
 from palpate.geometry.visibility import Gaps
 from palpate.meshfree import ShapeFunctions, shape_functions
 
 Array = NDArray[np.float64]
+RealOrComplex = NDArray[Any]
 
 SUPPORT_RADIUS_FACTOR = 2.2
 """Support radius over node spacing. By `collocation` the paper's cube is stable here, and not at 2.0, 2.4 or 2.6 for some
@@ -35,24 +37,36 @@ class NodalBasis:
     value: csr_array
     gaps: Gaps | None = None
 
-    def on_nodal_values(self, matrix: csr_array | Array) -> Array:
-        """(rows, n_nodes): A H⁻¹ for a matrix A (rows, n_nodes) that acts on parameters."""
-        transposed = matrix.T
-        if not isinstance(transposed, np.ndarray):
-            transposed = transposed.toarray(order="F")
-        return lu_solve(self._factor, transposed, trans=1, check_finite=False).T
+    def values(self, parameters: RealOrComplex) -> RealOrComplex:
+        """(c n_nodes, k): nodal values of fields (c n_nodes, k) given by their parameters, c components a node."""
+        return _on_each_component(self.value, parameters)
 
-    def at(self, points: Array) -> Array:
-        """(n_points, n_nodes): the field at the points (n_points, dim), m, from the nodal values.
+    def parameters(self, values: Array) -> Array:
+        """(n_nodes, k): the parameters of fields (n_nodes, k) given by their nodal values, of one component."""
+        return self._factor.solve(np.ascontiguousarray(values, dtype=np.float64))
+
+    def at(self, points: Array) -> csr_array:
+        """(n_points, n_nodes): the field at the points (n_points, dim), m, from its parameters.
 
         Raises SupportError naming the first point that too few nodes cover.
         """
-        return self.on_nodal_values(shape_functions(points, self.points, self.radii, gaps=self.gaps).value)
+        return shape_functions(points, self.points, self.radii, gaps=self.gaps).value
+
+    def values_at(self, points: Array, parameters: RealOrComplex) -> RealOrComplex:
+        """(c n_points, k): fields (c n_nodes, k) given by their parameters, at the points. Raises as `at`."""
+        return _on_each_component(self.at(points), parameters)
 
     @cached_property
-    def _factor(self) -> tuple[Array, NDArray[np.int32]]:
-        """The dense LU factor of H, made when it is first needed and kept."""
-        return lu_factor(self.value.toarray(order="F"), overwrite_a=True, check_finite=False)
+    def _factor(self) -> SuperLU:
+        """The sparse LU factor of H, made when it is first needed and kept."""
+        return splu(self.value.tocsc())
+
+
+def _on_each_component(operator: csr_array, parameters: RealOrComplex) -> RealOrComplex:
+    """(c n_rows, k): the operator (n_rows, n_nodes) on each component of fields (c n_nodes, k)."""
+    n_rows, n_nodes = operator.shape
+    by_node = parameters.reshape(n_nodes, -1)
+    return (operator @ by_node).reshape(n_rows * len(parameters) // n_nodes, -1)
 
 
 def nodal_basis(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eig, eigh
+from scipy.linalg import eig, eigh, lu_factor, lu_solve
 
 from palpate.discretization.assembled_body import AssembledBody
 from palpate.discretization.supports import components
@@ -15,16 +15,18 @@ from palpate.modes.elastic_modes import ElasticModes
 
 Array = NDArray[np.float64]
 RealOrComplex = NDArray[Any]
+Factor = tuple[Array, NDArray[np.int32]]
 
 
 def elastic_modes(body: AssembledBody) -> ElasticModes:
-    """All modes in nodal values: (c n_free)³ work. Raises MemoryError when the body has too many nodes for that."""
+    """All modes, computed in nodal values: (c n_free)³ work. Raises MemoryError when the body has too many nodes for that."""
     c, held = body.n_components, body.supports
     require_memory(body.n_nodes, len(held.free), c, body.symmetric)
     free = components(held.free, c)
     mass = np.repeat(body.mass[held.free], c)
     moving, followers = np.flatnonzero(mass > 0), np.flatnonzero(mass == 0)
-    stiffness, following = _condensed(nodal_stiffness(body), len(mass), moving, followers)
+    factor = _factor(body)
+    stiffness, following = _condensed(_nodal_stiffness(body, factor), len(mass), moving, followers)
     solve = _symmetric_modes if body.symmetric else _nonsymmetric_modes
     n = len(moving)
     coupling, force, direct = stiffness[:n, n:].copy(), stiffness[n:, :n].copy(), stiffness[n:, n:].copy()
@@ -42,8 +44,8 @@ def elastic_modes(body: AssembledBody) -> ElasticModes:
         input_coupling=input_coupling,
         output_coupling=input_coupling.T if body.symmetric else force @ vectors,
         direct_stiffness=direct,
-        shapes=shapes,
-        patch_shapes=patch_shapes,
+        parameters=_parameters(factor, shapes),
+        patch_parameters=_parameters(factor, patch_shapes),
     )
 
 
@@ -52,14 +54,18 @@ def nodal_stiffness(body: AssembledBody) -> Array:
 
     K H⁻¹, and H⁻ᵀ K H⁻¹ of a symmetric body, in which the nodes of a patch move as one and their forces add up.
     """
+    return _nodal_stiffness(body, _factor(body))
+
+
+def _nodal_stiffness(body: AssembledBody, factor: Factor) -> Array:
     c, kinematics = body.n_components, body.supports.kinematics
     m = kinematics.shape[1]
     stiffness = np.empty((m, c, m, c))
     for a in range(c):
         for b in range(a + 1 if body.symmetric else c):
-            block = body.basis.on_nodal_values(body.stiffness[a::c, b::c])
+            block = lu_solve(factor, body.stiffness[a::c, b::c].T.toarray(order="F"), trans=1).T
             if body.symmetric:
-                block = body.basis.on_nodal_values(block.T).T
+                block = lu_solve(factor, block, trans=1)
                 if a == b:
                     block = (block + block.T) / 2
             block = kinematics.T @ block @ kinematics
@@ -67,6 +73,17 @@ def nodal_stiffness(body: AssembledBody) -> Array:
             if body.symmetric:
                 stiffness[:, b, :, a] = block.T
     return stiffness.reshape(c * m, c * m)
+
+
+def _factor(body: AssembledBody) -> Factor:
+    """The dense LU factor of H, faster than a sparse one for as many right-hand sides as there are nodes."""
+    return lu_factor(body.basis.value.toarray(order="F"), overwrite_a=True, check_finite=False)
+
+
+def _parameters(factor: Factor, values: RealOrComplex) -> RealOrComplex:
+    """(c n_nodes, k): the parameters of fields given by their nodal values (c n_nodes, k)."""
+    n_nodes = len(factor[0])
+    return lu_solve(factor, values.reshape(n_nodes, -1), check_finite=False).reshape(values.shape)
 
 
 def _condensed(

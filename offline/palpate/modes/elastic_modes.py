@@ -16,7 +16,7 @@ class ElasticModes:
 
         s² q + h(s) diag(squared_frequencies) q = -h(s) input_coupling u
         force = h(s) (direct_stiffness u + output_coupling q)
-        nodal displacement = shapes q + patch_shapes u
+        parameters of the displacement field: parameters q + patch_parameters u
 
     so force(s) = h(s) [K_tt - sum_k c_k b_k^T h(s) / (s² + mu_k h(s))] u(s). The patch's own inertia is dropped.
 
@@ -24,9 +24,10 @@ class ElasticModes:
     input_coupling       (n_modes, n_inputs), b_k, mass-normalized
     output_coupling      (n_outputs, n_modes), c_k; the transpose of input_coupling for `conservative`
     direct_stiffness     (n_outputs, n_inputs), K_tt, N/m at rest
-    shapes               (3 n_nodes, n_modes), x, y, z of node 0, then of node 1, ...; m per unit q
-    patch_shapes         (3 n_nodes, n_inputs), m per m: identity on the patch, zero elsewhere; with `collocation`
-                         the traction-free surface follows the patch at once, and its part stands here too
+    parameters           (3 n_nodes, n_modes), x, y, z of node 0, then of node 1, ...; m per unit q. The basis of the body
+                         gives the field anywhere from them
+    patch_parameters     (3 n_nodes, n_inputs), m per m: nodal values are one on the patch, zero elsewhere; with
+                         `collocation` the traction-free surface follows the patch at once, and its part stands here too
 
     Inputs and outputs run over the contact patches in order, x, y, z each.
     """
@@ -35,8 +36,8 @@ class ElasticModes:
     input_coupling: NDArray[np.float64] | NDArray[np.complex128]
     output_coupling: NDArray[np.float64] | NDArray[np.complex128]
     direct_stiffness: NDArray[np.float64]
-    shapes: NDArray[np.float64] | NDArray[np.complex128]
-    patch_shapes: NDArray[np.float64]
+    parameters: NDArray[np.float64] | NDArray[np.complex128]
+    patch_parameters: NDArray[np.float64]
 
     @property
     def n_modes(self) -> int:

@@ -143,8 +143,8 @@ def test_a_body_that_nothing_holds_is_refused():
         modes.input_coupling,
         modes.output_coupling,
         modes.direct_stiffness,
-        modes.shapes,
-        modes.patch_shapes,
+        modes.parameters,
+        modes.patch_parameters,
     )
     with pytest.raises(ValueError, match=r"squared_frequencies\[0\] = 0"):
         viscoelastic_system(free, ONE_TERM)
@@ -158,8 +158,8 @@ def test_complex_frequencies_without_their_conjugates_are_refused():
         modes.input_coupling[kept],
         modes.output_coupling[:, kept],
         modes.direct_stiffness,
-        modes.shapes,
-        modes.patch_shapes,
+        modes.parameters,
+        modes.patch_parameters,
     )
     with pytest.raises(ValueError, match="conjugate pairs"):
         viscoelastic_system(half, ONE_TERM)

@@ -215,8 +215,8 @@ def test_surface_displacements_follow_the_full_model_between_the_fitted_frequenc
     surface = fit_surface_output(
         modes,
         LIVER_LIKE,
-        modes.shapes[rows],
-        modes.patch_shapes[rows],
+        modes.parameters[rows],
+        modes.patch_parameters[rows],
         running,
         period_s=PERIOD_S,
         band_hz=(0.0, 30.0),
@@ -227,7 +227,7 @@ def test_surface_displacements_follow_the_full_model_between_the_fitted_frequenc
         s = 2j * np.pi * frequency
         h = LIVER_LIKE.transfer_factor(np.array([s]))[0]
         gain = -h / (s**2 + modes.squared_frequencies * h)
-        exact = (modes.shapes * gain)[rows] @ modes.input_coupling + modes.patch_shapes[rows]
+        exact = (modes.parameters * gain)[rows] @ modes.input_coupling + modes.patch_parameters[rows]
         xi = np.linalg.solve(np.exp(s * PERIOD_S) * np.eye(running.order) - running.dense_a(), running.b)
         error = np.linalg.norm(surface.output @ xi + surface.feedthrough - exact, 2) / np.linalg.norm(
             exact, 2
@@ -241,8 +241,8 @@ def test_surface_shapes_that_do_not_match_the_modes_are_named(modes, full):
         fit_surface_output(
             modes,
             LIVER_LIKE,
-            modes.shapes[:9, :-1],
-            modes.patch_shapes[:9],
+            modes.parameters[:9, :-1],
+            modes.patch_parameters[:9],
             running,
             period_s=PERIOD_S,
             band_hz=(0.0, 30.0),

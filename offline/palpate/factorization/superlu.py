@@ -1,0 +1,38 @@
+"""SuperLU, which scipy brings along, used as a symmetric solver."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array, csr_array, triu
+from scipy.sparse.linalg import splu
+
+Array = NDArray[np.float64]
+
+
+class SuperLU:
+    """The factor of a symmetric matrix given by its upper triangle, with the pivots on the diagonal.
+
+    nnz         entries of L and U
+    n_negative  negative eigenvalues of the matrix (Sylvester's law), or None where a pivot left the diagonal
+    """
+
+    def __init__(self, upper: csr_array, definite: bool) -> None:
+        full = csc_array(upper + triu(upper, 1).T)
+        self._lu = splu(
+            full,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        self.nnz = int(self._lu.nnz)
+        symmetric = np.array_equal(self._lu.perm_r, self._lu.perm_c)
+        self.n_negative = int(np.count_nonzero(self._lu.U.diagonal() < 0)) if symmetric else None
+        if definite and self.n_negative:
+            raise np.linalg.LinAlgError(
+                f"{self.n_negative} pivots are negative: expected a positive definite matrix"
+            )
+
+    def solve(self, right: Array) -> Array:
+        """(n, k) for right-hand sides (n, k)."""
+        return self._lu.solve(right)
