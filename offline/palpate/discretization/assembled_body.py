@@ -39,6 +39,11 @@ class AssembledBody:
     supports: Supports
     symmetric: bool
 
+    def inertia(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(c n_nodes, k): M U = Hᵀ m H U of a symmetric body, for parameters (c n_nodes, k)."""
+        mass = np.repeat(self.mass, self.n_components)[:, None]
+        return self.basis.loads(mass * self.basis.values(parameters))
+
     @property
     def n_nodes(self) -> int:
         return len(self.mass)

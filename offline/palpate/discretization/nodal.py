@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from palpate.geometry.visibility import Gaps
@@ -41,6 +41,10 @@ class NodalBasis:
         """(c n_nodes, k): nodal values of fields (c n_nodes, k) given by their parameters, c components a node."""
         return _on_each_component(self.value, parameters)
 
+    def loads(self, forces: Array) -> Array:
+        """(c n_nodes, k): Hᵀ f, the loads on the parameters that forces (c n_nodes, k) on the nodes are, N."""
+        return _on_each_component(self.value.T, forces)
+
     def parameters(self, values: Array) -> Array:
         """(n_nodes, k): the parameters of fields (n_nodes, k) given by their nodal values, of one component."""
         return self._factor.solve(np.ascontiguousarray(values, dtype=np.float64))
@@ -62,7 +66,7 @@ class NodalBasis:
         return splu(self.value.tocsc())
 
 
-def _on_each_component(operator: csr_array, parameters: RealOrComplex) -> RealOrComplex:
+def _on_each_component(operator: csr_array | csc_array, parameters: RealOrComplex) -> RealOrComplex:
     """(c n_rows, k): the operator (n_rows, n_nodes) on each component of fields (c n_nodes, k)."""
     n_rows, n_nodes = operator.shape
     by_node = parameters.reshape(n_nodes, -1)

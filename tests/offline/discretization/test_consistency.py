@@ -1,4 +1,4 @@
-"""The consistent gradient: the correction by a sparse factor is that of the dense normal matrix with its null space filled."""
+"""The consistent gradient: the correction by a sparse factor is that of constrained least squares."""
 
 import numpy as np
 import pytest
@@ -12,13 +12,13 @@ from palpate.meshfree.kernel import quartic_spline
 
 
 def _clouds():
-    cube = box_lattice((0, 0, 0), (1, 1, 1), (6, 6, 6), 0.2, seed=3)
-    contact = Refinement((0.5, 0.5, 1.0), radius_m=0.1, spacing_m=0.05)
+    cube = box_lattice((0, 0, 0), (1, 1, 1), (5, 5, 5), 0.2, seed=3)
+    contact = Refinement((0.5, 0.5, 1.0), radius_m=0.1, spacing_m=0.15)
     return {
         "jittered": cube,
-        "flat": box_lattice((0, 0, 0), (1, 1, 0.3), (8, 8, 3)),
-        "graded": fill_surface(cube.surface, 0.2, [contact]),
-        "ball": ball(1.0, 0.3),
+        "flat": box_lattice((0, 0, 0), (1, 1, 0.3), (6, 6, 3)),
+        "graded": fill_surface(cube.surface, 0.4, [contact]),
+        "ball": ball(1.0, 0.4),
     }
 
 
@@ -48,10 +48,11 @@ def test_the_correction_is_the_smallest_that_obeys_the_divergence_theorem(name):
     sums[other, np.arange(len(node))] = unit * cloud.volumes[node]
     constraints = np.vstack([exact, sums])
     scale = np.linalg.norm(constraints, axis=1, keepdims=True)
-    for axis, plain in enumerate(h.gradient):
-        defect = h.value.T @ areas[:, axis] - plain.T @ cloud.volumes
-        wanted = np.concatenate([np.zeros(4 * n), defect]) / scale[:, 0]
-        gram = (constraints / scale) @ (constraints / scale).T
-        change = unit * ((constraints / scale).T @ np.linalg.lstsq(gram, wanted, rcond=1e-12)[0])
+    constraints /= scale
+    defect = h.value.T @ areas - np.column_stack([plain.T @ cloud.volumes for plain in h.gradient])
+    wanted = np.vstack([np.zeros((4 * n, 3)), defect]) / scale
+    multipliers, *_ = np.linalg.lstsq(constraints @ constraints.T, wanted, rcond=1e-12)
+    change = unit[:, None] * (constraints.T @ multipliers)
+    for plain, exact_derivative, by_axis in zip(h.gradient, corrected, change.T, strict=True):
         largest = np.abs(plain.data).max()
-        np.testing.assert_allclose(corrected[axis].data - plain.data, change, atol=1e-8 * largest)
+        np.testing.assert_allclose(exact_derivative.data - plain.data, by_axis, atol=1e-8 * largest)

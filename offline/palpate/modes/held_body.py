@@ -1,0 +1,115 @@
+"""The body held at some of its nodes, by one sparse factorization in the parameters of the shape functions.
+
+Shape functions do not interpolate, so nodes are held by constraints C U = 0 on the parameters, C being their rows of H.
+Two matrices serve them, both symmetric and sparse: K with a penalty, K + Cᵀ W C, which has the sparsity of K, and C Cᵀ.
+With P = I - Cᵀ (C Cᵀ)⁻¹ C, the projection onto C U = 0, P (K + Cᵀ W C)⁻¹ P is the inverse of P K P up to the compliance of
+the penalty, a few parts in a million. A solution that is corrected once more by its residual P (f - K U) is exact to
+round-off, and so are the constraints always. With a shift sigma all this holds for K + sigma M, M = Hᵀ m H.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array, eye_array, kron
+
+from palpate.discretization.assembled_body import AssembledBody
+from palpate.discretization.supports import Indices
+from palpate.factorization import SymmetricFactor, factorize
+
+Array = NDArray[np.float64]
+
+PENALTY = 1e6
+"""Stiffness of the penalty over that of a node: the supports give way by its inverse, the round-off grows with it."""
+
+_ACCEPTED_RESIDUAL = 1e-6
+_MOST_CORRECTIONS = 6
+
+
+@dataclass(frozen=True)
+class HeldBody:
+    """A symmetric body with the values of some nodes held at zero.
+
+    body         the nodes that are held here need not be those of body.supports
+    nodes        (n_held,), the held nodes
+    shift        sigma, (rad/s)², not negative
+    constraints  (c n_held, c n_nodes), C: their values from the parameters
+    factor       of K + sigma M + Cᵀ W C
+    gram         the factor of C Cᵀ of one component
+    """
+
+    body: AssembledBody
+    nodes: Indices
+    shift: float
+    constraints: csr_array
+    factor: SymmetricFactor
+    gram: SymmetricFactor
+
+    def project(self, parameters: Array) -> Array:
+        """P U: the parameters (c n_nodes, k) nearest to the given ones that hold the nodes; also P f of loads."""
+        held = self.constraints @ parameters
+        multipliers = self.gram.solve(held.reshape(len(self.nodes), -1)).reshape(held.shape)
+        return parameters - self.constraints.T @ multipliers
+
+    def approximate(self, load: Array) -> Array:
+        """P (K + sigma M + Cᵀ W C)⁻¹ P load: symmetric, the constraints exact, the rest up to the compliance of the penalty."""
+        return self.project(self.factor.solve(self.project(load)))
+
+    def solve(self, load: Array) -> Array:
+        """(c n_nodes, k): the parameters under loads (c n_nodes, k), N, which are conjugate to parameters.
+
+        Corrected until the residual no longer decreases. Raises LinAlgError where that leaves more than 1e-6 of the load.
+        """
+        load = self.project(load)
+        solution = self.approximate(load)
+        residual = self.project(load - self._reaction(solution))
+        for _ in range(_MOST_CORRECTIONS):
+            corrected = solution + self.approximate(residual)
+            left = self.project(load - self._reaction(corrected))
+            if not np.linalg.norm(left) < 0.5 * np.linalg.norm(residual):
+                break
+            solution, residual = corrected, left
+        error = float(np.linalg.norm(residual) / max(np.linalg.norm(load), np.finfo(float).tiny))
+        if not error <= _ACCEPTED_RESIDUAL:
+            raise np.linalg.LinAlgError(
+                f"static solution: the residual is {error:.1e} of the load, expected at most {_ACCEPTED_RESIDUAL:.0e}: the "
+                "held nodes do not keep the body from moving"
+            )
+        return solution
+
+    def _reaction(self, parameters: Array) -> Array:
+        """(K + sigma M) U."""
+        static = self.body.stiffness @ parameters
+        return static + self.shift * self.body.inertia(parameters) if self.shift else static
+
+
+def hold(body: AssembledBody, nodes: Indices, shift: float = 0.0) -> HeldBody:
+    """Factorize K + shift M with the nodes held; the shift, (rad/s)², is not negative.
+
+    Raises ValueError for a body that is not symmetric; LinAlgError where the nodes do not hold the body or the shape
+    functions of two held nodes are the same; MemoryError where the factor does not fit.
+    """
+    if not body.symmetric:
+        raise ValueError("the body is not symmetric: expected one of the conservative discretization")
+    rows = body.basis.value[nodes]
+    return HeldBody(
+        body=body,
+        nodes=nodes,
+        shift=shift,
+        constraints=csr_array(kron(rows, eye_array(body.n_components), format="csr")),
+        factor=factorize(penalized(body, nodes, shift)),
+        gram=factorize(csr_array(rows @ rows.T)),
+    )
+
+
+def penalized(body: AssembledBody, nodes: Indices, shift: float) -> csr_array:
+    """(c n_nodes, c n_nodes): K + shift M + Cᵀ W C, with the sparsity of K."""
+    c, value = body.n_components, body.basis.value
+    strongest = body.stiffness.diagonal().reshape(-1, c).max(axis=1)
+    weight = np.zeros(body.n_nodes)
+    weight[nodes] = PENALTY * strongest[nodes]
+    weight += shift * body.mass
+    added = value.T @ (diags_array(weight) @ value)
+    return csr_array(body.stiffness + kron(added, eye_array(c), format="csr"))

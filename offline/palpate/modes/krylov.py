@@ -1,0 +1,64 @@
+"""Vectors that are orthonormal in the mass: the basis which Ritz modes and the lowest modes are computed in."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr, solve_triangular
+
+from palpate.modes.held_body import HeldBody
+
+Array = NDArray[np.float64]
+
+_DEFLATED = 1e-8
+"""A vector of which orthogonalization leaves less than this fraction holds nothing new."""
+
+
+class KrylovSpace:
+    """Vectors V, parameters of fields that are zero at the held nodes, with Vᵀ M V = 1.
+
+    M = Hᵀ m H is never formed: with Y = m^{1/2} H V, Vᵀ M V is Yᵀ Y.
+    """
+
+    def __init__(self, n_parameters: int, most: int) -> None:
+        """Room for `most` vectors. Raises MemoryError where they do not fit."""
+        self._vectors = np.empty((n_parameters, most), order="F")
+        self._weighted = np.empty((n_parameters, most), order="F")
+        self._last_block = slice(0, 0)
+        self.size = 0
+
+    @property
+    def vectors(self) -> Array:
+        """(c n_nodes, size), V."""
+        return self._vectors[:, : self.size]
+
+    def extend(self, held: HeldBody) -> bool:
+        """Append the static response of the held body to the inertia of the last block, (K + sigma M)⁻¹ M V.
+
+        False where that holds nothing new, or does not fit any more.
+        """
+        return self.append(held, held.approximate(held.body.inertia(self._vectors[:, self._last_block])))
+
+    def append(self, held: HeldBody, fields: Array) -> bool:
+        """Append a block that spans parameters (c n_nodes, k) beside the vectors before. False as in `extend`."""
+        root_mass = np.repeat(np.sqrt(held.body.mass), held.body.n_components)[:, None]
+        before, weighted_before = self.vectors, self._weighted[:, : self.size]
+        weighted = root_mass * held.body.basis.values(fields)
+        largest = np.linalg.norm(weighted, axis=0).max()
+        count = 0
+        for first in (True, False):  # the second time for what cancellation has left of orthogonality
+            along = weighted_before.T @ weighted
+            _, triangle, order = qr(weighted - weighted_before @ along, mode="economic", pivoting=True)
+            if first:
+                count = int(np.count_nonzero(np.abs(np.diagonal(triangle)) > _DEFLATED * largest))
+                if count == 0 or self.size + count > self._vectors.shape[1]:
+                    return False
+            fields = (fields - before @ along)[:, order[:count]]
+            # It has also left less of the constraints and of the link between V and Y: both are made exact again.
+            fields = held.project(solve_triangular(triangle[:count, :count], fields.T, trans="T").T)
+            weighted = root_mass * held.body.basis.values(fields)
+        self._last_block = slice(self.size, self.size + count)
+        self._vectors[:, self._last_block] = fields
+        self._weighted[:, self._last_block] = weighted
+        self.size += count
+        return True
