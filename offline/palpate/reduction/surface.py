@@ -44,8 +44,8 @@ def fit_surface_output(
 ) -> SurfaceOutput:
     """Least squares over the band, relative at each frequency, with the reduced poles fixed and the statics exact.
 
-    surface_shapes        (3 n_surface, n_modes), the rows of modes.shapes (or combinations of them) on the surface
-    surface_patch_shapes  (3 n_surface, n_inputs), those of modes.patch_shapes
+    surface_shapes        (3 n_surface, n_modes), the displacements of the modes on the surface
+    surface_patch_shapes  (3 n_surface, n_inputs), those of the patch displacements
     discrete              the reduced model as it runs at period_s
 
     The full surface response (patch_shapes - sum_k shapes_k b_k^T h/(s² + mu_k h)) is fitted by

@@ -17,7 +17,7 @@ def _clouds():
     return {
         "jittered": cube,
         "flat": box_lattice((0, 0, 0), (1, 1, 0.3), (6, 6, 3)),
-        "graded": fill_surface(cube.surface, 0.4, [contact]),
+        "graded": fill_surface(cube.surface, 0.25, [contact]),
         "ball": ball(1.0, 0.4),
     }
 
