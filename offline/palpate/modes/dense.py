@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
@@ -19,9 +18,8 @@ Factor = tuple[Array, NDArray[np.int32]]
 
 
 def elastic_modes(body: AssembledBody) -> ElasticModes:
-    """All modes, computed in nodal values: (c n_free)³ work. Raises MemoryError when the body has too many nodes for that."""
+    """All modes, computed in nodal values: (c n_free)³ work."""
     c, held = body.n_components, body.supports
-    require_memory(body.n_nodes, len(held.free), c, body.symmetric)
     free = components(held.free, c)
     mass = np.repeat(body.mass[held.free], c)
     moving, followers = np.flatnonzero(mass > 0), np.flatnonzero(mass == 0)
@@ -124,16 +122,7 @@ def _nonsymmetric_modes(
     return mu, vectors, np.linalg.solve(vectors, (coupling / mass[:, None]).astype(np.complex128))
 
 
-def require_memory(n_nodes: int, n_free: int, n_components: int, symmetric: bool) -> None:
-    """Raise MemoryError where all modes of a body need more memory than the machine has: to be asked before assembly.
-
-    n_free  nodes that are neither held nor in a patch
-    """
+def dense_memory(n_nodes: int, n_free: int, n_components: int, symmetric: bool) -> float:
+    """Bytes that all modes of a body need; n_free nodes are neither held nor in a patch."""
     matrices = 3 if symmetric else 6  # complex vectors count twice
-    needed = 8 * (matrices * (n_components * n_free) ** 2 + 5 * n_nodes**2)
-    present = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > present:
-        raise MemoryError(
-            f"all modes of {n_nodes} nodes need about {needed / 2**30:.1f} GiB, this machine has {present / 2**30:.1f}: "
-            "use a coarser cloud, graded towards the contact patches"
-        )
+    return 8.0 * (matrices * (n_components * n_free) ** 2 + 5 * n_nodes**2)
