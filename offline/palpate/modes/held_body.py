@@ -25,6 +25,7 @@ PENALTY = 1e6
 """Stiffness of the penalty over that of a node: the supports give way by its inverse, the round-off grows with it."""
 
 _ACCEPTED_RESIDUAL = 1e-6
+_EXACT = 1e-12
 _MOST_CORRECTIONS = 6
 
 
@@ -60,12 +61,14 @@ class HeldBody:
     def solve(self, load: Array) -> Array:
         """(c n_nodes, k): the parameters under loads (c n_nodes, k), N, which are conjugate to parameters.
 
-        Corrected until the residual no longer decreases. Raises LinAlgError where that leaves more than 1e-6 of the load.
+        Corrected until the residual is 1e-12 of the load or no longer decreases. Raises LinAlgError where that leaves more than 1e-6 of the load.
         """
         load = self.project(load)
         solution = self.approximate(load)
         residual = self.project(load - self._reaction(solution))
         for _ in range(_MOST_CORRECTIONS):
+            if np.linalg.norm(residual) <= _EXACT * np.linalg.norm(load):
+                break
             corrected = solution + self.approximate(residual)
             left = self.project(load - self._reaction(corrected))
             if not np.linalg.norm(left) < 0.5 * np.linalg.norm(residual):

@@ -18,6 +18,9 @@ class KrylovSpace:
     """Vectors V, parameters of fields that are zero at the held nodes, with Vᵀ M V = 1.
 
     M = Hᵀ m H is never formed: with Y = m^{1/2} H V, Vᵀ M V is Yᵀ Y.
+
+    size          number of vectors
+    coefficients  (size, k): what was appended last, in the vectors
     """
 
     def __init__(self, n_parameters: int, most: int) -> None:
@@ -26,6 +29,7 @@ class KrylovSpace:
         self._weighted = np.empty((n_parameters, most), order="F")
         self._last_block = slice(0, 0)
         self.size = 0
+        self.coefficients = np.zeros((0, 0))
 
     @property
     def vectors(self) -> Array:
@@ -45,14 +49,18 @@ class KrylovSpace:
         before, weighted_before = self.vectors, self._weighted[:, : self.size]
         weighted = root_mass * held.body.basis.values(fields)
         largest = np.linalg.norm(weighted, axis=0).max()
-        count = 0
+        count, new = 0, np.eye(fields.shape[1])
+        coefficients = np.zeros((self.size, fields.shape[1]))
         for first in (True, False):  # the second time for what cancellation has left of orthogonality
             along = weighted_before.T @ weighted
             _, triangle, order = qr(weighted - weighted_before @ along, mode="economic", pivoting=True)
             if first:
                 count = int(np.count_nonzero(np.abs(np.diagonal(triangle)) > _DEFLATED * largest))
+                self.coefficients = along
                 if count == 0 or self.size + count > self._vectors.shape[1]:
                     return False
+            coefficients += along @ new
+            new = triangle[:count, np.argsort(order)] @ new
             fields = (fields - before @ along)[:, order[:count]]
             # It has also left less of the constraints and of the link between V and Y: both are made exact again.
             fields = held.project(solve_triangular(triangle[:count, :count], fields.T, trans="T").T)
@@ -61,4 +69,5 @@ class KrylovSpace:
         self._vectors[:, self._last_block] = fields
         self._weighted[:, self._last_block] = weighted
         self.size += count
+        self.coefficients = np.vstack([coefficients, new])
         return True
