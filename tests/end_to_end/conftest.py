@@ -82,6 +82,7 @@ class Program:
             lambda: (self.process.poll(), self.printed()),
             f"the end of {self.process.args}",
             lambda seen: seen[0] is not None,
+            START_S,
         )[0]
         err = self.err.read_text()
         assert "Traceback" not in err, err
