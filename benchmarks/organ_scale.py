@@ -25,12 +25,11 @@ CONFIGS = Path(__file__).parents[1] / "configs"
 
 
 class Recorder:
-    """A progress that keeps (stage, wall s, processor s, peak GiB) of each stage that has ended."""
+    """A progress that prints and keeps (stage, wall s, processor s, peak GiB) of each stage that has ended."""
 
     def __init__(self) -> None:
         self.rows: list[tuple[str, float, float, float]] = []
-        self.notes: list[str] = []
-        self._name = ""
+        self._name = self._note = ""
         self._wall = self._cpu = 0.0
 
     def __call__(self, stage: str) -> None:
@@ -38,13 +37,18 @@ class Recorder:
         if self._name:
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
             self.rows.append((self._name, wall - self._wall, cpu - self._cpu, peak))
-        self._name, self._wall, self._cpu = stage, wall, cpu
+            print(line(*self.rows[-1]), self._note, flush=True)
+        self._name, self._note, self._wall, self._cpu = stage, "", wall, cpu
 
     def note(self, text: str) -> None:
-        self.notes.append(f"{self._name}: {text}")
+        self._note = text
 
     def warn(self, text: str) -> None:
-        self.notes.append(f"warning: {text}")
+        print(f"warning: {text}", flush=True)
+
+
+def line(stage: str, wall: float, cpu: float, peak: float) -> str:
+    return f"{stage[:40]:40} {wall:8.1f} {cpu:8.1f} {peak:9.2f} "
 
 
 def build(spacing_mm: float, superlu: bool) -> None:
@@ -60,11 +64,7 @@ def build(spacing_mm: float, superlu: bool) -> None:
     recorder = Recorder()
     model = build_model(Config.model_validate(scene), CONFIGS, recorder)
     recorder("end")
-    print(
-        json.dumps(
-            {"nodes": model.n_nodes, "solver": solver_name(), "rows": recorder.rows, "notes": recorder.notes}
-        )
-    )
+    print(json.dumps({"nodes": model.n_nodes, "solver": solver_name(), "rows": recorder.rows}))
 
 
 def main() -> None:
@@ -82,24 +82,28 @@ def main() -> None:
     records = []
     for spacing in options.spacings_mm:
         command = [sys.executable, __file__, "--one", str(spacing)] + ["--superlu"] * options.superlu
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            print(f"{spacing:g} mm failed: {done.stderr.strip().splitlines()[-1]}", flush=True)
+        print(f"\n{f'{spacing:g} mm':40} {'wall s':>8} {'cpu s':>8} {'peak GiB':>9}", flush=True)
+        record = run(command)
+        if record is None:
+            print(f"{spacing:g} mm failed", flush=True)
             continue
-        record = json.loads(done.stdout.splitlines()[-1])
         records.append(record)
-        show(spacing, record)
+        _, walls, cpus, peaks = zip(*record["rows"], strict=True)
+        title = f"all, {record['nodes']:,} nodes, {record['solver']}"
+        print(line(title, sum(walls), sum(cpus), max(peaks)), flush=True)
     show_exponents(records)
 
 
-def show(spacing_mm: float, record: dict) -> None:
-    print(f"\n{record['nodes']:,} nodes, {spacing_mm:g} mm, {record['solver']}")
-    print(f"{'stage':60} {'wall s':>8} {'cpu s':>8} {'peak GiB':>9}")
-    for stage, wall, cpu, peak in record["rows"]:
-        print(f"{stage[:60]:60} {wall:8.1f} {cpu:8.1f} {peak:9.2f}")
-    walls, cpus = (sum(row[k] for row in record["rows"]) for k in (1, 2))
-    print(f"{'all':60} {walls:8.1f} {cpus:8.1f} {max(row[3] for row in record['rows']):9.2f}")
-    print("\n".join(record["notes"]), flush=True)
+def run(command: list[str]) -> dict | None:
+    """The record of a build, whose other lines are shown as they come; None where it fails."""
+    record = None
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        for text in process.stdout or ():
+            if text.startswith("{"):
+                record = json.loads(text)
+            else:
+                print(text, end="", flush=True)
+    return record if process.returncode == 0 else None
 
 
 def show_exponents(records: list[dict]) -> None:
@@ -107,12 +111,12 @@ def show_exponents(records: list[dict]) -> None:
     for record in records:
         for stage, _, cpu, _ in record["rows"]:
             by_stage.setdefault(stage, []).append((record["nodes"], cpu))
-    print(f"\n{'stage':60} {'exponent':>9} {'from nodes':>16}")
+    print(f"\n{'stage':40} {'exponent':>9} {'from nodes':>16}")
     for stage, points in by_stage.items():
         if len(points) > 1:
             nodes, seconds = np.log(np.array(points)).T
             print(
-                f"{stage[:60]:60} {np.polyfit(nodes, seconds, 1)[0]:9.2f} {points[0][0]:7,}-{points[-1][0]:,}"
+                f"{stage[:40]:40} {np.polyfit(nodes, seconds, 1)[0]:9.2f} {points[0][0]:7,}-{points[-1][0]:,}"
             )
 
 

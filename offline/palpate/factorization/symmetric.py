@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, triu
+from scipy.sparse import csr_array
 
 from palpate.factorization import pardiso
 from palpate.factorization.superlu import SuperLU
@@ -91,11 +91,21 @@ def factorize(matrix: csr_array, *, definite: bool = True) -> SymmetricFactor:
     Raises LinAlgError where a definite matrix has a pivot that is not positive or an indefinite one is singular,
     MemoryError where the factor does not fit.
     """
-    upper = csr_array(triu(matrix, format="csr"))
-    upper.sort_indices()
+    upper = _upper_triangle(matrix)
     name = solver_name()
     backend = pardiso.Pardiso(upper, definite) if name == "MKL PARDISO" else SuperLU(upper, definite)
     return SymmetricFactor(upper, backend, name)
+
+
+def _upper_triangle(matrix: csr_array) -> csr_array:
+    """The upper triangle with sorted indices; scipy's `triu` makes three copies of the matrix on the way."""
+    rows = np.repeat(np.arange(matrix.shape[0], dtype=np.int32), np.diff(matrix.indptr))
+    kept = matrix.indices >= rows
+    counts = np.bincount(rows[kept], minlength=matrix.shape[0])
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    upper = csr_array((matrix.data[kept], matrix.indices[kept], starts), shape=matrix.shape)
+    upper.sort_indices()
+    return upper
 
 
 def _times(upper: csr_array, x: Array) -> Array:
