@@ -112,7 +112,7 @@ def build_full_model(config: Config, folder: Path, progress: Progress = NO_PROGR
 
     n_free = cloud.n_nodes - len(fixed) - sum(len(p.nodes) for p in patches)
     symmetric = config.discretization.method == "conservative"
-    require_memory(cloud.n_nodes, n_free, symmetric, config.discretization.support_radius)
+    require_memory(cloud.n_nodes, n_free, len(patches), symmetric, config.discretization.support_radius)
     progress(f"assembly, {config.discretization.method}")
     assemble = _ASSEMBLE[config.discretization.method]
     body = assemble(cloud, material, fixed, [p.nodes for p in patches], config.discretization.support_radius)

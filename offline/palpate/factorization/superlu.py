@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, triu
@@ -13,11 +15,10 @@ Array = NDArray[np.float64]
 class SuperLU:
     """The factor of a symmetric matrix given by its upper triangle, with the pivots on the diagonal.
 
-    nnz         entries of L and U
-    n_negative  negative eigenvalues of the matrix (Sylvester's law), or None where a pivot left the diagonal
+    nnz  entries of L and U
     """
 
-    def __init__(self, upper: csr_array, definite: bool) -> None:
+    def __init__(self, upper: csr_array) -> None:
         full = csc_array(upper + triu(upper, 1).T)
         self._lu = splu(
             full,
@@ -26,12 +27,16 @@ class SuperLU:
             options={"SymmetricMode": True},
         )
         self.nnz = int(self._lu.nnz)
-        symmetric = np.array_equal(self._lu.perm_r, self._lu.perm_c)
-        self.n_negative = int(np.count_nonzero(self._lu.U.diagonal() < 0)) if symmetric else None
-        if definite and self.n_negative:
-            raise np.linalg.LinAlgError(
-                f"{self.n_negative} pivots are negative: expected a positive definite matrix"
-            )
+
+    @cached_property
+    def n_negative(self) -> int | None:
+        """Negative eigenvalues of the matrix (Sylvester's law), or None where a pivot left the diagonal.
+
+        Computed when it is asked for, because scipy copies the whole factor for it.
+        """
+        if not np.array_equal(self._lu.perm_r, self._lu.perm_c):
+            return None
+        return int(np.count_nonzero(self._lu.U.diagonal() < 0))
 
     def solve(self, right: Array) -> Array:
         """(n, k) for right-hand sides (n, k)."""

@@ -33,18 +33,21 @@ class _Backend(Protocol):
 class SymmetricFactor:
     """A factorized symmetric matrix A.
 
-    solver      name of the direct solver
-    nnz         entries of the factor
-    n_negative  number of negative eigenvalues of A, or None where the solver can't tell
+    solver  name of the direct solver
+    nnz     entries of the factor
     """
 
     def __init__(self, upper: csr_array, backend: _Backend, solver: str) -> None:
         self.solver = solver
         self.nnz = backend.nnz
-        self.n_negative = backend.n_negative
         self._backend = backend
         self._upper = upper
         self._norm = float(np.max(_times(abs(upper), np.ones(upper.shape[0]))))
+
+    @property
+    def n_negative(self) -> int | None:
+        """Number of negative eigenvalues of A, or None where the solver can't tell."""
+        return self._backend.n_negative
 
     def solve(self, right: Array) -> Array:
         """A⁻¹ right, for (n,) or (n, k).
@@ -88,12 +91,12 @@ def factorize(matrix: csr_array, *, definite: bool = True) -> SymmetricFactor:
 
     definite  whether all eigenvalues are expected to be positive
 
-    Raises LinAlgError where a definite matrix has a pivot that is not positive or an indefinite one is singular,
-    MemoryError where the factor does not fit.
+    Raises LinAlgError where a matrix that is said to be definite is not, by MKL PARDISO (SuperLU factorizes it, and
+    n_negative tells), or where one is singular; MemoryError where the factor does not fit.
     """
     upper = _upper_triangle(matrix)
     name = solver_name()
-    backend = pardiso.Pardiso(upper, definite) if name == "MKL PARDISO" else SuperLU(upper, definite)
+    backend = pardiso.Pardiso(upper, definite) if name == "MKL PARDISO" else SuperLU(upper)
     return SymmetricFactor(upper, backend, name)
 
 

@@ -21,7 +21,10 @@ TOLERANCE = 1e-3
 """Change of the force over the last 60 Ritz vectors of a patch, where no more are added."""
 
 _ABOVE_THE_BAND = 5.0
-_STEPS_ABOVE_THE_BAND = 40
+STEPS_ABOVE_THE_BAND = 40
+STEPS_EXPECTED = 80
+"""Steps at 0 Hz that are usual: 240 vectors of one patch."""
+
 _FREQUENCIES = 60
 
 
@@ -52,7 +55,7 @@ def body_modes(body: AssembledBody, prony: PronySeries, band_end_hz: float) -> B
     s = 2j * np.pi * np.concatenate([even, slow * band_end_hz])
     sigma = (2 * np.pi * _ABOVE_THE_BAND * band_end_hz) ** 2
     found = ritz_modes(
-        body, s**2 / prony.transfer_factor(s), TOLERANCE, shifts=[(sigma, _STEPS_ABOVE_THE_BAND)]
+        body, s**2 / prony.transfer_factor(s), TOLERANCE, shifts=[(sigma, STEPS_ABOVE_THE_BAND)]
     )
     return BodyModes(found.modes, found.change, found.solver)
 
@@ -62,15 +65,18 @@ def by_ritz(n_nodes: int, symmetric: bool) -> bool:
     return symmetric and n_nodes > ALL_MODES_UP_TO
 
 
-def require_memory(n_nodes: int, n_free: int, symmetric: bool, support_radius_factor: float) -> None:
+def require_memory(
+    n_nodes: int, n_free: int, n_contacts: int, symmetric: bool, support_radius_factor: float
+) -> None:
     """Raise MemoryError where the modes of a solid need more memory than the machine has: to be asked before assembly.
 
     n_free  nodes that are neither held nor in a patch
     """
     ritz = by_ritz(n_nodes, symmetric)
-    needed = (
-        ritz_memory(n_nodes, support_radius_factor) if ritz else dense_memory(n_nodes, n_free, 3, symmetric)
-    )
+    if ritz:
+        needed = ritz_memory(n_nodes, n_contacts, support_radius_factor)
+    else:
+        needed = dense_memory(n_nodes, n_free, 3, symmetric)
     present = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > present:
         raise MemoryError(
@@ -79,14 +85,15 @@ def require_memory(n_nodes: int, n_free: int, symmetric: bool, support_radius_fa
         )
 
 
-def ritz_memory(n_nodes: int, support_radius_factor: float) -> float:
-    """Bytes at the peak of the Ritz modes of a solid with one patch, from runs with 1,753 to 31,666 nodes.
+def ritz_memory(n_nodes: int, n_contacts: int, support_radius_factor: float) -> float:
+    """Bytes at the peak of the Ritz modes of a solid, the process included.
 
-    The factor has some 37 n^1.6 entries at a support radius of 2.2 spacings and 0.6 times as many at 1.8. SuperLU
-    stores both triangles, and as much again while it works.
+    By runs with 1,753 to 31,666 nodes: the stiffness matrix has up to 9 * 228 n entries and the factor 37 n^1.6 at a
+    support radius of 2.2 spacings; 0.45 and 0.6 times as many at 1.8. Before the factor is made there are five copies of
+    the matrix, beside it three. SuperLU keeps both triangles, and needs as much again while it works.
     """
     wider = support_radius_factor / 2.2
     stiffness = 12 * 9 * 228 * n_nodes * wider**4
-    factor = 8 * 37 * n_nodes**1.6 * wider**2.5
-    vectors = 2 * 8 * 3 * n_nodes * 3 * 120
-    return 3 * stiffness + factor * (1 if solver_name() == "MKL PARDISO" else 4) + vectors
+    factor = 8 * 37 * n_nodes**1.6 * wider**2.5 * (1 if solver_name() == "MKL PARDISO" else 4)
+    vectors = 2 * 8 * 3 * n_nodes * (STEPS_EXPECTED + STEPS_ABOVE_THE_BAND) * 3 * n_contacts
+    return 0.35 * 2**30 + max(5 * stiffness, 3 * stiffness + factor + vectors)

@@ -42,4 +42,4 @@ def test_a_cloud_too_large_for_the_machine_is_refused_with_the_memory_it_would_t
     with pytest.raises(
         MemoryError, match=rf"{kind} modes of {n_nodes:,} nodes need about \d+\.\d GiB, this machine has 0.0"
     ):
-        require_memory(n_nodes, n_nodes - 100, symmetric, 2.2)
+        require_memory(n_nodes, n_nodes - 100, 1, symmetric, 2.2)
