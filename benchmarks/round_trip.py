@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.model_file import load_model, save_model
-from palpate_server import wire
+from palpate_server import codec
 from palpate_server.diagnostics.round_trips import (
     RATE_HZ,
     RoundTrips,
@@ -41,7 +41,7 @@ def main() -> None:
         model = load_model(path)
         tool = model.contacts[0].name
         n = len(model.contacts)
-        force_bytes = len(wire.ForceEncoder(n).encode(0, 0, wire.as_words(np.zeros(n, PORT_RECORD))))
+        force_bytes = len(codec.ForceEncoder(n).encode(0, 0, codec.as_words(np.zeros(n, PORT_RECORD))))
         command_bytes = len(encode_command(tool, 10**6, 10**15, (0.1, 0.2, 0.3)))
         print(
             f"order {model.order}, {n} tools; "

@@ -26,7 +26,7 @@ from numba import njit
 from numba.core.runtime import _nrt_python as _nrt
 from numba.core.runtime import rtsys
 
-from palpate_server import wire
+from palpate_server import codec
 from palpate_server.bodies import state_space
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.realtime import scheduler, shared_memory
@@ -135,8 +135,8 @@ def row(order: int, contacts: int, runs: int) -> None:
     ticks_args = (memory.commands.incoming, make_image(memory), time.monotonic_ns(), int(memory.period_ns[0]))
     run_ticks(1, *ticks_args)
     entry, ticks = (allocations(lambda n=n: run_ticks(n, *ticks_args)) for n in (0, STEPS))
-    encoder = wire.ForceEncoder(contacts)
-    ports = wire.as_words(memory.ring.ports)[0]
+    encoder = codec.ForceEncoder(contacts)
+    ports = codec.as_words(memory.ring.ports)[0]
 
     def encode() -> None:
         for k in range(STEPS):

@@ -27,7 +27,7 @@ from palpate_client.messages import (
 )
 
 QUERY_TIMEOUT_S = 3.0
-LONG_QUERY_TIMEOUT_S = 10.0  # `load` and `record`
+LONG_QUERY_TIMEOUT_S = 10.0  # for wire.SLOW_ACTIONS
 RETRY_PAUSE_S = 0.05
 
 Subscription = Any  # zenoh.Subscriber: `undeclare()` ends it
@@ -154,7 +154,7 @@ class Connection:
 
     def control(self, action: str, **fields: Any) -> dict[str, Any]:
         """Ask for one of wire.ACTIONS; `fields` and answer as in docs/wire.md. Raises what `ask` raises."""
-        timeout_s = LONG_QUERY_TIMEOUT_S if action in ("load", "record") else QUERY_TIMEOUT_S
+        timeout_s = LONG_QUERY_TIMEOUT_S if action in wire.SLOW_ACTIONS else QUERY_TIMEOUT_S
         payload = self.ask(self.keys.control(self.name, action), fields, timeout_s=timeout_s)
         try:
             return wire.unpack(payload, wire.Kind.ANSWER)

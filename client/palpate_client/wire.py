@@ -36,6 +36,7 @@ MAX_VELOCITY_M_PER_S = 1e3
 MAX_INTEGER = 2**63 - 1  # of every integer field; none is below 0
 
 ACTIONS = ("acquire", "release", "limits", "reset", "load", "record")  # of control queries
+SLOW_ACTIONS = ("load", "record")  # these take up to seconds; a client waits longer for their answers
 
 
 class Kind(StrEnum):

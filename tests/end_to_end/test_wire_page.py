@@ -15,7 +15,7 @@ import pytest
 from palpate_client import Frame, decode_geometry, decode_surface
 from palpate_client.messages import force_of, read_description
 from palpate_client.wire import ACTIONS, Flags, Kind, unpack
-from palpate_server import wire
+from palpate_server import codec
 from palpate_server.session.devices import PROFILES, stiffness_warnings
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
@@ -53,7 +53,7 @@ def test_the_bytes_of_an_example_are_its_map(title: str) -> None:
 
 def test_the_server_reads_the_example_of_a_command() -> None:
     message, payload = EXAMPLES["Command"]
-    command = wire.decode_command(payload)
+    command = codec.decode_command(payload)
     assert command.sequence == message["sequence"]
     assert command.position_m == {"tip": tuple(message["position_m"]["tip"])}
     assert command.velocity_m_per_s == {"tip": tuple(message["velocity_m_per_s"]["tip"])}
@@ -99,11 +99,11 @@ def test_the_server_encodes_geometry_and_surface_as_in_the_examples() -> None:
     geometry, payload = EXAMPLES["Geometry"]
     vertices = np.frombuffer(geometry["vertices_m"], "<f4").reshape(-1, 3).astype(float)
     triangles = np.frombuffer(geometry["triangles"], "<i4").reshape(-1, 3)
-    assert wire.encode_geometry(vertices, triangles) == payload
+    assert codec.encode_geometry(vertices, triangles) == payload
     assert decode_geometry(payload).triangles.tolist() == triangles.ravel().tolist()
     surface, payload = EXAMPLES["Surface"]
     displacement = np.frombuffer(surface["displacement_m"], "<f4")
-    assert wire.encode_surface(surface["tick"], surface["server_time_ns"], displacement) == payload
+    assert codec.encode_surface(surface["tick"], surface["server_time_ns"], displacement) == payload
     assert decode_surface(payload).displacement_m.tolist() == displacement.tolist()
 
 

@@ -42,17 +42,17 @@ from palpate_client.wire import (
     pack,
     unpack,
 )
-from palpate_server import wire
+from palpate_server import codec
+from palpate_server.errors import Refused
 from palpate_server.realtime.records import PORT_RECORD
 from palpate_server.realtime.safety import Limits
 from palpate_server.recording.recorder import Recorder
 from palpate_server.session.fields import read_request
-from palpate_server.session.leases import Refused
 from palpate_server.session.state import SessionState
 from palpate_server.session.status import description, status
 
 PAGE = Path(__file__).parents[2] / "docs" / "wire.md"
-SERVER = Path(wire.__file__).parent
+SERVER = Path(codec.__file__).parent
 GOOD: dict[str, Any] = {
     "kind": "command",
     "sequence": 3,
@@ -83,10 +83,10 @@ def test_the_facts_of_the_wire_need_neither_numpy_nor_numba() -> None:
 
 
 def test_a_command_is_read_as_it_was_meant() -> None:
-    assert wire.decode_command(pack(GOOD)) == wire.Command(
-        3, 5, {"tip": (0.0, 1e-3, -2.0)}, {"tip": wire.STILL}
+    assert codec.decode_command(pack(GOOD)) == codec.Command(
+        3, 5, {"tip": (0.0, 1e-3, -2.0)}, {"tip": codec.STILL}
     )
-    assert wire.decode_command(pack(MOVING)) == wire.Command(
+    assert codec.decode_command(pack(MOVING)) == codec.Command(
         3, 5, {"tip": (0.0, 1e-3, -2.0)}, {"tip": (1.0, 2.0, 3.0)}, 7
     )
 
@@ -94,32 +94,32 @@ def test_a_command_is_read_as_it_was_meant() -> None:
 @pytest.mark.parametrize("field", ["velocity_m_per_s", "rendered_tick"])
 def test_nil_in_an_optional_field_is_the_field_left_out(field: str) -> None:
     left_out, nil = pack(without(MOVING, field)), pack(MOVING | {field: None})
-    assert wire.decode_command(nil) == wire.decode_command(left_out)
+    assert codec.decode_command(nil) == codec.decode_command(left_out)
 
 
 def test_a_velocity_map_may_be_empty_or_name_some_of_the_tools() -> None:
     two = GOOD | {"position_m": {"a": [0, 0, 0], "b": [0, 0, 0]}}
-    assert wire.decode_command(pack(GOOD | {"velocity_m_per_s": {}})) == wire.decode_command(pack(GOOD))
-    velocity = wire.decode_command(pack(two | {"velocity_m_per_s": {"b": [0, 0, 1]}})).velocity_m_per_s
-    assert velocity == {"a": wire.STILL, "b": (0.0, 0.0, 1.0)}
+    assert codec.decode_command(pack(GOOD | {"velocity_m_per_s": {}})) == codec.decode_command(pack(GOOD))
+    velocity = codec.decode_command(pack(two | {"velocity_m_per_s": {"b": [0, 0, 1]}})).velocity_m_per_s
+    assert velocity == {"a": codec.STILL, "b": (0.0, 0.0, 1.0)}
 
 
 @pytest.mark.parametrize(
     "value", [b"\xc0", b"\x91\x01", msgpack.packb(msgpack.ExtType(5, b"x")), b"\xcf" + b"\xff" * 8]
 )
 def test_unknown_fields_are_ignored_so_that_the_schema_can_grow(value: bytes) -> None:
-    assert wire.decode_command(with_unknown_field(value)) == wire.decode_command(pack(GOOD))
+    assert codec.decode_command(with_unknown_field(value)) == codec.decode_command(pack(GOOD))
 
 
 def test_of_a_field_that_stands_twice_the_last_one_counts() -> None:
     sequence = msgpack.packb("sequence")
     twice = bytes([0x80 + len(GOOD) + 1]) + sequence + b"\x01" + msgpack.packb(GOOD)[1:]
-    assert wire.decode_command(twice).sequence == GOOD["sequence"]
+    assert codec.decode_command(twice).sequence == GOOD["sequence"]
 
 
 def test_the_order_of_fields_does_not_matter() -> None:
     backwards = dict(reversed(GOOD.items()))
-    assert wire.decode_command(pack(backwards)) == wire.decode_command(pack(GOOD))
+    assert codec.decode_command(pack(backwards)) == codec.decode_command(pack(GOOD))
 
 
 @pytest.mark.parametrize(
@@ -161,16 +161,16 @@ def test_the_order_of_fields_does_not_matter() -> None:
 )
 def test_a_malformed_command_is_named_by_what_is_wrong(payload: bytes, reason: str) -> None:
     with pytest.raises(MalformedMessage) as caught:
-        wire.decode_command(payload)
+        codec.decode_command(payload)
     assert caught.value.reason == reason
     assert reason in MALFORMED
 
 
 def test_the_largest_integers_are_read() -> None:
     largest = GOOD | {"sequence": 2**63 - 1, "client_time_ns": 2**63 - 1, "rendered_tick": 2**63 - 1}
-    command = wire.decode_command(pack(largest))
+    command = codec.decode_command(pack(largest))
     assert (command.sequence, command.client_time_ns, command.rendered_tick) == (2**63 - 1,) * 3
-    assert wire.decode_command(pack(GOOD | {"position_m": {"tip": [2**64 - 1, 0, 0]}})).position_m == {
+    assert codec.decode_command(pack(GOOD | {"position_m": {"tip": [2**64 - 1, 0, 0]}})).position_m == {
         "tip": (2.0**64, 0.0, 0.0)
     }
 
@@ -179,7 +179,7 @@ def test_the_largest_integers_are_read() -> None:
 @given(payload=st.binary(max_size=300))
 def test_random_bytes_are_malformed_or_a_command_but_nothing_else(payload: bytes) -> None:
     try:
-        wire.decode_command(payload)
+        codec.decode_command(payload)
     except MalformedMessage as error:
         assert error.reason in MALFORMED
 
@@ -191,7 +191,7 @@ def test_any_value_in_any_field_gives_a_whole_command_or_a_reason(
 ) -> None:
     for replacement in (value, {name: value}, {name: [value, 0.0, value]}):
         try:
-            command = wire.decode_command(msgpack.packb(MOVING | {field: replacement}))
+            command = codec.decode_command(msgpack.packb(MOVING | {field: replacement}))
         except MalformedMessage as error:
             assert error.reason in MALFORMED
         else:
@@ -230,7 +230,7 @@ def test_a_client_of_version_1_is_told_what_to_do() -> None:
 
 
 def test_a_message_of_another_kind_is_not_taken_for_one() -> None:
-    encoder = wire.ForceEncoder(1)
+    encoder = codec.ForceEncoder(1)
     force = encoder.encode(0, 0, no_ticks(1))
     assert unpack(force, Kind.FORCE)["tick"] == 0
     with pytest.raises(MalformedMessage) as caught:
@@ -244,7 +244,7 @@ def test_names_that_could_change_a_key_expression_are_refused(name: object) -> N
 
 
 def no_ticks(n: int) -> Any:
-    return wire.as_words(np.zeros(n, PORT_RECORD))
+    return codec.as_words(np.zeros(n, PORT_RECORD))
 
 
 @settings(deadline=None)
@@ -262,14 +262,14 @@ def test_forces_carry_every_number_unchanged(n_tools: int, tick: int, number: fl
     for name in ("position_m", "force_n", "force_scale", "energy_j"):
         ports[name] = random.normal(size=ports[name].shape)
     ports["client_time_ns"][-1], ports["force_n"][-1, 1] = integer, number
-    payload = wire.ForceEncoder(n_tools).encode(tick, 10, wire.as_words(ports))
+    payload = codec.ForceEncoder(n_tools).encode(tick, 10, codec.as_words(ports))
     expected = {name: ports[name].tolist() for name in list(FORCE_FIELDS)[2:]}
     assert msgpack.unpackb(payload) == {"kind": "force", "tick": tick, "server_time_ns": 10} | expected
 
 
 def test_surface_displacements_are_little_endian_float32() -> None:
     displacement = np.array([1.5, -2.25, 0.0], np.float32)
-    message = unpack(wire.encode_surface(1, 2, displacement), Kind.SURFACE)
+    message = unpack(codec.encode_surface(1, 2, displacement), Kind.SURFACE)
     np.testing.assert_array_equal(np.frombuffer(message["displacement_m"], "<f4"), displacement)
 
 
@@ -383,9 +383,9 @@ def test_the_page_lists_exactly_the_fields_of_a_description(state: SessionState)
 
 
 def test_the_page_lists_exactly_the_fields_of_geometry_and_surface() -> None:
-    geometry = msgpack.unpackb(wire.encode_geometry(np.zeros((1, 3)), np.zeros((1, 3), np.int32)))
+    geometry = msgpack.unpackb(codec.encode_geometry(np.zeros((1, 3)), np.zeros((1, 3), np.int32)))
     assert _fields("Geometry") == list(geometry)
-    assert _fields("Surface") == list(msgpack.unpackb(wire.encode_surface(0, 0, np.zeros(3, np.float32))))
+    assert _fields("Surface") == list(msgpack.unpackb(codec.encode_surface(0, 0, np.zeros(3, np.float32))))
 
 
 def test_the_settings_on_the_page_are_a_configuration_for_a_client() -> None:
@@ -419,13 +419,13 @@ def test_the_page_lists_the_keys_of_the_code() -> None:
 
 
 def test_the_page_lists_exactly_the_fields_of_a_force() -> None:
-    message = msgpack.unpackb(wire.ForceEncoder(1).encode(0, 0, no_ticks(1)))
+    message = msgpack.unpackb(codec.ForceEncoder(1).encode(0, 0, no_ticks(1)))
     assert [row[0].strip("`") for row in _table("Force")] == list(message)
 
 
 def test_the_page_lists_exactly_the_fields_of_a_command() -> None:
     fields = [row[0].strip("`") for row in _table("Command")]
-    assert fields == ["kind", *wire.Command._fields]
+    assert fields == ["kind", *codec.Command._fields]
 
 
 def test_the_page_lists_exactly_the_control_actions_of_the_code() -> None:

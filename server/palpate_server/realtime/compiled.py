@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 from numba import njit
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
-from palpate_client import wire as client_wire
+from palpate_client import wire
 
 _COMPILED_ROOMS = ("bodies", "coupling", "realtime")
 
@@ -54,7 +54,7 @@ def _package_digest() -> str:
     digest = hashlib.sha256()
     folder = Path(__file__).parents[1]
     paths = [path for room in _COMPILED_ROOMS for path in folder.joinpath(room).glob("*.py")]
-    for path in [*sorted(paths), folder / "wire.py", Path(client_wire.__file__)]:
+    for path in [*sorted(paths), folder / "codec.py", Path(wire.__file__)]:
         source = path.read_bytes()
         digest.update(f"{path.name} {len(source)}\n".encode() + source)
     return digest.hexdigest()

@@ -30,8 +30,8 @@ from palpate_server.realtime.shared_memory import (
 
 _BIN_NS = 1_000  # of a histogram
 
-# The tissue counts as at rest when every tip is at its start and no force has been above this for so many ticks. Its state
-# is then put to zero exactly, which also keeps it from decaying into slow denormal numbers.
+# The tissue is at rest when, for _REST_TICKS in a row, every tip is at its start and no force is above _REST_FORCE_N. Its state
+# is then set to zero. Otherwise it would decay into denormal numbers, which are slow.
 _REST_FORCE_N = 1e-9
 _REST_TICKS = 500
 
@@ -42,7 +42,7 @@ _CAUGHT_UP = int(Flags.CAUGHT_UP)
 
 @compiled
 def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
-    """The tick that is due at `deadline` and begins at `start`; `missed`, when a later one follows at once."""
+    """Run the tick that was due at `deadline`, from `start` on, ns; `missed`: another due tick follows at once."""
     counters = m.counters[0]
     tick = counters.ticks
     record = m.ring.ticks[tick % RECORDS]
@@ -78,7 +78,7 @@ def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
 
 @compiled
 def _note_lateness(m: Memory, deadline: int, start: int, missed: bool) -> int:
-    """Count how late a tick is; the flags of the tick."""
+    """Count the tick's lateness. Returns the flags of the tick: LATE, CAUGHT_UP."""
     counters = m.counters[0]
     flags = 0
     lateness = start - deadline
@@ -94,7 +94,7 @@ def _note_lateness(m: Memory, deadline: int, start: int, missed: bool) -> int:
 
 @compiled
 def _move(m: Memory, i: int, start: int, tick_flags: int) -> None:
-    """Move a port's tip, and the patch or tip of the model with it."""
+    """Move a port's tip, write its displacement in the model's frame, and begin the port's record."""
     one, settings, command = m.ports[i], m.settings[i], m.used[i]
     # A command may come between the start of the tick and here.
     age = max(0, start - command.arrival_ns) if command.sequence >= 0 else -1
@@ -115,11 +115,9 @@ def _move(m: Memory, i: int, start: int, tick_flags: int) -> None:
 
 @compiled
 def _render(m: Memory, i: int, tick: int, fault: int) -> None:
-    """Have a port give out its force, and record it."""
+    """Turn the coupling's force on a port into the device's, and complete the port's record."""
     one = m.ports[i]
-    rendered_tick = m.used[i].rendered_tick
-    told = 0 <= rendered_tick < tick and tick - rendered_tick < RECORDS
-    rendered = m.ring.ports[(rendered_tick if told else tick - 1) % RECORDS, i]
+    rendered = m.ring.ports[rendered_before(tick, m.used[i].rendered_tick) % RECORDS, i]
     for j in range(3):
         one.rendered_force_n[j] = rendered.force_n[j]
     flags = port.render(one, m.settings[i], m.force[i], m.period_ns[0] * 1e-9)
@@ -137,8 +135,18 @@ def _render(m: Memory, i: int, tick: int, fault: int) -> None:
 
 
 @compiled
+def rendered_before(tick: int, rendered_tick: int) -> int:
+    """The tick whose force the device rendered before `tick`: the one that its client names, if the ring still holds it.
+
+    rendered_tick  of the command, -1 without one; then the device is taken to render the force of the tick before
+    """
+    is_held = 0 <= rendered_tick < tick and tick - rendered_tick < RECORDS
+    return rendered_tick if is_held else tick - 1
+
+
+@compiled
 def _settle(m: Memory) -> None:
-    """Put the state to zero when what is left of it is negligible."""
+    """Zero the state exactly after _REST_TICKS quiet ticks."""
     counters = m.counters[0]
     still = not couplings.is_fading(m.coupling)
     for i in range(m.force.shape[0]):
@@ -151,9 +159,9 @@ def _settle(m: Memory) -> None:
 
 @compiled
 def _read_commands(m: Memory) -> None:
-    """Take the newest command of every tool, and note which are new.
+    """Take the newest command of every tool, and mark the ports whose command is new.
 
-    A writer that is interrupted can't hold the loop up: after MAX_READS the commands before are used again.
+    The read is tried MAX_READS times. If a writer was interrupted in between, this tick uses the previous commands.
     """
     commands = m.commands
     for i in range(m.ports.shape[0]):
@@ -184,7 +192,7 @@ def _write_snapshot(m: Memory, tick: int) -> None:
 
 @compiled
 def count(m: Memory, histogram: int, duration_ns: int) -> None:
-    """Enter a duration into one of the histograms."""
+    """Add a duration to a histogram."""
     duration = max(duration_ns, 0)
     m.longest_ns[histogram] = max(m.longest_ns[histogram], duration)
     m.histograms[histogram, min(duration // _BIN_NS, HISTOGRAM_BINS - 1)] += 1
@@ -192,7 +200,7 @@ def count(m: Memory, histogram: int, duration_ns: int) -> None:
 
 @compiled
 def put_to_rest(m: Memory, i: int) -> None:
-    """Put a port's tip to its start."""
+    """Move a port's tip to its tool's start."""
     port.put_to_rest(m.ports[i], m.settings[i].home_m)
     for j in range(3):
         m.displacement[i, j] = 0.0

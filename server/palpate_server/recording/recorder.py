@@ -25,11 +25,11 @@ import numpy as np
 
 from palpate.files import LONGEST_NAME_BYTES, is_plain_name
 from palpate_client.wire import Keys, pack
+from palpate_server.errors import Refused
 from palpate_server.realtime import scheduler
 from palpate_server.realtime.records import RECORDS
 from palpate_server.realtime.shared_memory import Memory, Records
 from palpate_server.recording.json_records import FULL
-from palpate_server.session.leases import Refused
 
 log = logging.getLogger("palpate_server")
 

@@ -42,6 +42,7 @@ from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.records import COMMAND, PORT_RECORD, RECORDS, TICK
 from palpate_server.realtime.safety import Limits
 from palpate_server.realtime.shared_memory import Memory, Saved
+from palpate_server.realtime.tick import rendered_before
 from palpate_server.recording import snapshot
 from palpate_server.recording.json_records import from_objects
 
@@ -233,9 +234,8 @@ def _feed(memory: Memory, commands: NDArray[np.void], ports: NDArray[np.void], b
     memory.commands.newest[:] = commands
     tick = int(memory.counters["ticks"][0])
     for tool, rendered in enumerate(commands["rendered_tick"].tolist()):
-        told = 0 <= rendered < tick and tick - rendered < RECORDS
-        rendered = rendered if told else tick - 1
-        if rendered < begin:  # from before the stretch, the force that the device rendered is an input too
+        rendered = rendered_before(tick, rendered)
+        if rendered < begin:  # recorded before this stretch: its force is an input too
             memory.ring.ports["force_n"][rendered % RECORDS, tool] = ports["rendered_force_n"][tool]
 
 

@@ -7,7 +7,7 @@ import struct
 import numpy as np
 
 from palpate_client.wire import MAX_COMMAND_BYTES, MalformedMessage, check_size, last_chunk
-from palpate_server import wire
+from palpate_server import codec
 from palpate_server.realtime import scheduler
 from palpate_server.realtime.records import COMMAND
 from palpate_server.session.state import SessionState
@@ -26,7 +26,7 @@ class Admission:
         self._state = state
         self._incoming = state.memory.commands.incoming.view(np.uint8).data
 
-    def admit(self, key: str, payload: wire.Payload, arrival_ns: int) -> int:
+    def admit(self, key: str, payload: codec.Payload, arrival_ns: int) -> int:
         """Carry out a command as a whole, or count why not; the number of ticks that ran with it.
 
         key: palpate/SESSION/command/CLIENT. arrival_ns: when it came, on the monotonic clock
@@ -34,7 +34,7 @@ class Admission:
         messages = self._state.messages
         try:
             check_size(len(payload), MAX_COMMAND_BYTES)
-            command = wire.decode_command(payload.to_bytes())
+            command = codec.decode_command(payload.to_bytes())
         except MalformedMessage as error:
             messages.malformed[error.reason] += 1
             return 0
@@ -50,7 +50,7 @@ class Admission:
         messages.accepted += 1
         return ticks
 
-    def _write(self, command: wire.Command, client: str, arrival_ns: int) -> str | None:
+    def _write(self, command: codec.Command, client: str, arrival_ns: int) -> str | None:
         """Put a command where `arrive` finds it; one of wire.REFUSED when the client may not give it."""
         state = self._state
         if not state.running:

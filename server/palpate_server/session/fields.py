@@ -20,8 +20,8 @@ from palpate_client.wire import (
     check_kind,
     unpack_map,
 )
+from palpate_server.errors import Refused
 from palpate_server.session.devices import PROFILES, Device
-from palpate_server.session.leases import Refused
 
 SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
 FARTHEST_ORIGIN_M = 10.0

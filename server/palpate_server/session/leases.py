@@ -6,16 +6,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from palpate_client.messages import Frame, Vector
+from palpate_server.errors import Refused
 from palpate_server.realtime.safety import Limits
 from palpate_server.session.devices import Device
-
-
-class Refused(Exception):
-    """A request that is not granted; `reason` is one of wire.NOT_GRANTED, the message says it in full."""
-
-    def __init__(self, reason: str, message: str) -> None:
-        super().__init__(message)
-        self.reason = reason
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from typing import Any
 from palpate.files import LONGEST_NAME_BYTES, is_plain_name
 from palpate.model_file import ModelFileError, ReducedModel
 from palpate_server.coupling import fixed_patch
+from palpate_server.errors import Refused
 from palpate_server.realtime import shared_memory
 from palpate_server.recording.snapshot import identity
 from palpate_server.session.devices import warnings_for
 from palpate_server.session.fields import shown
-from palpate_server.session.leases import Refused
 from palpate_server.session.model_process import load_model_elsewhere
 from palpate_server.session.state import SessionState
 

@@ -13,7 +13,7 @@ import numpy as np
 import zenoh
 
 from palpate_client.wire import ENCODING, pack
-from palpate_server import wire
+from palpate_server import codec
 from palpate_server.realtime import scheduler, threads
 from palpate_server.realtime.records import RECORDS
 from palpate_server.recording.black_box import BlackBox
@@ -32,9 +32,9 @@ class ForcePublisher:
         self._state = state
         self._wake = wake
         self._sending = threading.Lock()
-        self._encoder = wire.ForceEncoder(len(state.tools))
+        self._encoder = codec.ForceEncoder(len(state.tools))
         ring = state.memory.ring  # stays the same when the model is exchanged
-        self._start_ns, self._ports = ring.ticks["start_ns"], wire.as_words(ring.ports)
+        self._start_ns, self._ports = ring.ticks["start_ns"], codec.as_words(ring.ports)
         self._sent = 0
         self._publisher = _publisher(session, state.keys.force, zenoh.Priority.REAL_TIME, express=True)
 
@@ -123,7 +123,7 @@ class SurfacePublisher:
         self._last_tick = tick
         displacement = surface.output @ model_state.astype(np.float32)
         displacement += surface.feedthrough @ self._tips.ravel().astype(np.float32)
-        self._publisher.put(wire.encode_surface(tick, time.monotonic_ns(), displacement))
+        self._publisher.put(codec.encode_surface(tick, time.monotonic_ns(), displacement))
 
 
 def _publisher(

@@ -1,4 +1,4 @@
-"""Queries and leases, one after another on a thread of their own: a Zenoh callback that did the work would stall the session."""
+"""Answers queries and follows the clients' liveliness tokens, on one thread: in a Zenoh callback this work would stall the session."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from palpate_client.wire import (
     ACTIONS,
     ENCODING,
     MAX_REQUEST_BYTES,
+    SLOW_ACTIONS,
     Keys,
     Kind,
     MalformedMessage,
@@ -22,14 +23,13 @@ from palpate_client.wire import (
     last_chunk,
     pack,
 )
+from palpate_server.errors import Refused
 from palpate_server.realtime import threads
 from palpate_server.session.fields import read_request
-from palpate_server.session.leases import Refused
 from palpate_server.session.requests import Requests
 
 log = logging.getLogger("palpate_server")
 
-_SLOW_ACTIONS = ("load", "record")
 MAX_WAITING = 64  # queries; more are refused at once
 _LEASES_FIRST, _QUERIES, _END = range(3)  # the order in which events are served
 
@@ -67,16 +67,16 @@ class Queries:
 
     def take_control(self, query: zenoh.Query) -> None:
         key = str(query.key_expr)
-        self._take(query, lambda: self._carry_out(query, key), apart=last_chunk(key) in _SLOW_ACTIONS)
+        self._take(query, lambda: self._carry_out(query, key), apart=last_chunk(key) in SLOW_ACTIONS)
 
     def take_liveliness(self, sample: zenoh.Sample) -> None:
         client, alive = last_chunk(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT
         self._queue(_LEASES_FIRST, lambda: self._requests.on_client(client, alive))
 
     def _take(self, query: zenoh.Query, answer: Callable[[], None], apart: bool = False) -> None:
-        """Have a query answered, `apart` on a thread of its own: such an answer takes its time and changes no lease."""
+        """Queue a query. `apart`: answer it on a thread of its own, because it is slow; it may not change leases."""
         try:
-            # A large one is not left waiting: many would take much room.
+            # Checked before it is queued, so that large queries do not fill the memory.
             parts = (query.payload, query.attachment)
             check_size(sum(len(part) for part in parts if part is not None), MAX_REQUEST_BYTES)
             if self._events.qsize() >= MAX_WAITING:
@@ -97,8 +97,10 @@ class Queries:
     # Called by the queries' own thread
 
     def run(self) -> None:
-        """Serve one event after another, until `end`."""
-        threads.raise_priority(threads.SERVICE_PRIORITY)  # not allowed: the loop's thread has said so
+        """Handle events one by one, until `end` is called."""
+        threads.raise_priority(
+            threads.SERVICE_PRIORITY
+        )  # the deadline thread logs it when this is not allowed
         urgency = _QUERIES
         while urgency != _END:
             urgency, _, event = self._events.get()
@@ -108,7 +110,7 @@ class Queries:
                 log.exception("a query could not be answered")
 
     def end(self) -> None:
-        """Have `run` return when what waits has been served."""
+        """Have `run` return after the events that are already queued."""
         self._queue(_END, lambda: None)
 
     def _client_and_action(self, key: str) -> tuple[str, str]:
@@ -134,7 +136,7 @@ class Queries:
 
 
 def _answer(query: zenoh.Query, answer: Callable[[], None]) -> None:
-    """Answer a query, whatever happens: who waits for the answer must not wait in vain."""
+    """Reply to a query in every case, so that the client does not wait for its timeout."""
     with query:
         try:
             answer()
@@ -142,7 +144,7 @@ def _answer(query: zenoh.Query, answer: Callable[[], None]) -> None:
             _refuse(query, error.reason, str(error))
         except Exception:
             log.exception("a query could not be answered")
-            _refuse(query, "internal", "the server failed at it; its log says why")
+            _refuse(query, "internal", "internal error; see the server's log")
 
 
 def _refuse(query: zenoh.Query, reason: str, message: str) -> None:

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from palpate_client.wire import RECORDER
+from palpate_server.errors import Refused
 from palpate_server.realtime import scheduler
 from palpate_server.recording.recorder import Recorder, file_in, room_in
-from palpate_server.session.leases import Refused
 from palpate_server.session.state import SessionState
 from palpate_server.session.status import description
 

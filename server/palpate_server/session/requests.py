@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from palpate_client.messages import Frame
+from palpate_server.errors import Refused
 from palpate_server.realtime import safety, scheduler
 from palpate_server.realtime.safety import Limits
 from palpate_server.session import fields
 from palpate_server.session.devices import Device, limits_for
-from palpate_server.session.leases import Refused, ToolSettings
+from palpate_server.session.leases import ToolSettings
 from palpate_server.session.loading import ModelLoader, warnings_of
 from palpate_server.session.recordings import Recordings
 from palpate_server.session.state import SessionState

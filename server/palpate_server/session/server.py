@@ -15,7 +15,7 @@ import zenoh
 
 from palpate.model_file import ReducedModel
 from palpate_client.wire import Keys, pack
-from palpate_server import wire
+from palpate_server import codec
 from palpate_server.realtime import safety, scheduler, shared_memory, threads
 from palpate_server.realtime.safety import Limits
 from palpate_server.recording.black_box import BlackBox
@@ -90,7 +90,7 @@ class Server:
             keys,
             self._requests,
             describe=lambda: pack(description(state)),
-            geometry=lambda: wire.encode_geometry(
+            geometry=lambda: codec.encode_geometry(
                 state.model.surface.vertices, state.model.surface.triangles
             ),
             on_change=self._status.publish,  # so that every setting is told, however soon it changes again

@@ -11,12 +11,13 @@ from typing import Any
 from palpate.model_file import ReducedModel
 from palpate_client.messages import Frame
 from palpate_client.wire import MALFORMED, REFUSED, Keys
+from palpate_server.errors import Refused
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import Limits
 from palpate_server.recording import snapshot
 from palpate_server.recording.recorder import Recorder
-from palpate_server.session.leases import Leases, Refused, ToolSettings
+from palpate_server.session.leases import Leases, ToolSettings
 
 CHANGE_TIMEOUT_S = 1.0
 

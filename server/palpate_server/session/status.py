@@ -1,4 +1,4 @@
-"""What the server says of itself, as plain maps: the status message and the describe reply."""
+"""The status message and the answer to `describe`, as plain maps."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def percentiles(counts: NDArray[np.int64], longest_ns: int) -> dict[str, float |
     return {"p50": at(0.5), "p99": at(0.99), "p99_9": at(0.999), "max": longest_s}
 
 
-def recent_success_rate(memory: shared_memory.Memory, tool: int) -> float:
-    """Share of the last 100 ticks in which a new command of the tool's client had come in time."""
+def success_rate(memory: shared_memory.Memory, tool: int) -> float:
+    """Share of the last ROLLING_TICKS ticks that had a new command for the tool in time."""
     head = int(scheduler.records_written(memory.shared))
     if head == 0:
         return 0.0
@@ -58,16 +58,16 @@ def recent_success_rate(memory: shared_memory.Memory, tool: int) -> float:
 
 
 def dropped(memory: shared_memory.Memory, messages: MessageCounters) -> dict[str, int]:
-    """What was accepted or made and then not used, by reason, as in wire.DROPPED.
+    """Accepted commands that no tick used, and forces that were not sent, as in palpate_client.wire.DROPPED.
 
-    A command that waits for the tick at this moment is not yet used and counts as superseded until it is.
+    A command that still waits for its tick counts as superseded until the tick has used it.
     """
     superseded = int(memory.commands.accepted.sum() - memory.ports["fresh_ticks"].sum())
     return dict(zip(DROPPED, (max(0, superseded), messages.unsent_forces), strict=True))
 
 
-def success_rate(memory: shared_memory.Memory, tool: int) -> float | None:
-    """Share of the ticks since the start in which a new command had come in time, of those with a client; None without."""
+def success_rate_since_start(memory: shared_memory.Memory, tool: int) -> float | None:
+    """Of the ticks in which the tool had a command, the share with a new one; None if it never had one."""
     commanded, fresh = (int(memory.ports[name][tool]) for name in ("commanded_ticks", "fresh_ticks"))
     return fresh / commanded if commanded else None
 
@@ -100,8 +100,8 @@ def _tool_status(state: SessionState, name: str) -> dict[str, Any]:
     settings, index = state.leases.settings[name], state.tool_index[name]
     return {
         "holder": state.leases.holders[name],
-        "success_rate": recent_success_rate(state.memory, index),
-        "success_rate_since_start": success_rate(state.memory, index),
+        "success_rate": success_rate(state.memory, index),
+        "success_rate_since_start": success_rate_since_start(state.memory, index),
         "limits": settings.limits._asdict(),
         "frame": asdict(settings.frame),
         "home_m": settings.home_m,
@@ -109,7 +109,7 @@ def _tool_status(state: SessionState, name: str) -> dict[str, Any]:
 
 
 def description(state: SessionState) -> dict[str, Any]:
-    """The describe reply: what a client must know before it moves anything."""
+    """The answer to `describe`."""
     summary = state.model.summary()
     summary["accuracy"].pop("hankel_singular_values")
     return {
@@ -134,5 +134,5 @@ def description(state: SessionState) -> dict[str, Any]:
         "status_period_s": STATUS_PERIOD_S,
         "surface_period_s": state.surface_period_s,
         "flags": {flag.name: flag.value for flag in Flags},
-        "model": {"kind": "patch"} | summary,
+        "model": summary,
     }

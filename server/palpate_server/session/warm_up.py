@@ -9,7 +9,7 @@ import threading
 import numpy as np
 
 from palpate.model_file import StateSpace
-from palpate_server import wire
+from palpate_server import codec
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import Limits
@@ -46,7 +46,7 @@ def _call_each(period_s: float, n_tools: int) -> None:
     image = make_image(memory)
     scheduler.arrive(image, 1)
     scheduler.records_written(memory.shared)
-    wire.ForceEncoder(n_tools).encode(0, 0, wire.as_words(memory.ring.ports)[0])
+    codec.ForceEncoder(n_tools).encode(0, 0, codec.as_words(memory.ring.ports)[0])
     scheduler.is_silent(image, 0)
     scheduler.set_frame(image, 0, np.eye(3), 1.0, np.zeros(3))
     scheduler.set_limits(image, 0, np.ones(len(Limits._fields)))

@@ -34,7 +34,7 @@ def package(tmp_path: Path) -> Path:
     folder = tmp_path / "source" / "gauge" / "realtime"
     folder.mkdir(parents=True)
     shutil.copy(compiled.__file__, folder / "compiled.py")
-    for path in (folder / "__init__.py", folder.parent / "__init__.py", folder.parent / "wire.py"):
+    for path in (folder / "__init__.py", folder.parent / "__init__.py", folder.parent / "codec.py"):
         path.touch()
     (folder / "callee.py").write_text(CALLEE.format("2.0"))
     (folder / "caller.py").write_text(CALLER)
@@ -72,7 +72,7 @@ def test_an_edit_of_any_file_makes_all_compiled_code_out_of_date_and_nothing_els
     assert (edited["result"], edited["hits"]) == (6.0, 0)
     for index in folder.rglob("*.nbi"):
         index.write_bytes(index.read_bytes()[:-20])  # of the version before: must not even be read
-    for another in (package / "another.py", package.parent / "wire.py"):
+    for another in (package / "another.py", package.parent / "codec.py"):
         another.write_text("NUMBER = 1\n")
         assert call(package, NUMBA_CACHE_DIR=str(folder))["hits"] == 0
     (package.parent / "session.py").write_text("NUMBER = 1\n")

@@ -14,10 +14,10 @@ import pytest
 from mcap.reader import make_reader
 
 from palpate_client.wire import Keys
+from palpate_server.errors import Refused
 from palpate_server.realtime.records import RECORDS
 from palpate_server.recording import recorder, replay
 from palpate_server.recording.recorder import Recorder
-from palpate_server.session.leases import Refused
 
 Loop = Any
 

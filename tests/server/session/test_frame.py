@@ -7,8 +7,8 @@ import pytest
 
 from palpate_client import Frame
 from palpate_client.wire import MalformedMessage
+from palpate_server.errors import Refused
 from palpate_server.session.fields import frame_in
-from palpate_server.session.leases import Refused
 
 
 def test_what_is_missing_or_none_is_that_of_the_identity() -> None:

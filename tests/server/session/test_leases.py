@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from palpate_client import Frame
+from palpate_server.errors import Refused
 from palpate_server.realtime.safety import Limits
-from palpate_server.session.leases import Leases, Refused, ToolSettings
+from palpate_server.session.leases import Leases, ToolSettings
 
 SETTINGS = ToolSettings(Limits(1.0, 1.0, 1.0, 1.0, 0.0), Frame(), (0.0, 0.0, 0.0))
 

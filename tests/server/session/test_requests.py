@@ -13,9 +13,9 @@ import pytest
 
 from palpate.model_file import save_model
 from palpate_client.wire import MalformedMessage
+from palpate_server.errors import Refused
 from palpate_server.realtime import scheduler
 from palpate_server.session import state as state_module
-from palpate_server.session.leases import Refused
 from palpate_server.session.requests import Requests
 
 

@@ -43,12 +43,12 @@ def test_success_rate_is_the_share_of_recent_ticks_with_a_new_command(
     model = make_spring_mass_model()
     limits = Limits(1.0, 1.0, 1.0, 1.0, 0.0)
     memory = shared_memory.make_memory(model.discrete, model.period_s, [limits], 1 / 30)
-    assert status.recent_success_rate(memory, 0) == 0
+    assert status.success_rate(memory, 0) == 0
     memory.shared[shared_memory.HEAD] = 500
     memory.ring.ports["flags"][:500] = int(Flags.STALE)
     memory.ring.ports["flags"][400:480] = int(Flags.SOFT_START)
     memory.ring.ports["flags"][480:490] = int(Flags.HELD)
-    assert status.recent_success_rate(memory, 0) == 0.8
+    assert status.success_rate(memory, 0) == 0.8
 
 
 def test_the_status_message_is_plain_data(make_spring_mass_model: Callable[..., ReducedModel]) -> None:
