@@ -9,7 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_server.diagnostics.round_trips import RATE_HZ, SETTLE_S, Heard, RoundTrips, answered, driven
+from palpate_server.diagnostics.round_trips import (
+    RATE_HZ,
+    SETTLE_S,
+    ReceivedForce,
+    RoundTrips,
+    answered,
+    driven,
+)
 
 
 @dataclass(frozen=True)
@@ -60,7 +67,7 @@ def steady_trace(ticks: int, late: int) -> Trace:
     return Trace(device_ns, np.maximum(np.arange(ticks) - late, -1), device_ns, device_ns, np.arange(ticks))
 
 
-def trace_of(sent_ns: Sequence[int], heard: Sequence[Heard]) -> Trace:
+def trace_of(sent_ns: Sequence[int], heard: Sequence[ReceivedForce]) -> Trace:
     """Of commands 1, 2, ... sent at these times, each at a tick of a device, and the forces that came, in order of ticks.
 
     What a tick did whose force was lost is not known: it is taken to have used the command of the tick before again.

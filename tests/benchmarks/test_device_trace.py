@@ -9,7 +9,7 @@ import pytest
 
 from device_trace import trace_of, trace_through_a_model
 from palpate.model_file import save_model
-from palpate_server.diagnostics.round_trips import Heard
+from palpate_server.diagnostics.round_trips import ReceivedForce
 from palpate_server.diagnostics.sample_model import spring_mass_model
 
 MS = 1_000_000
@@ -18,13 +18,21 @@ MS = 1_000_000
 def test_a_trace_tells_late_superseded_held_and_lost_messages_from_each_other() -> None:
     sent = [MS * k for k in range(1, 9)]  # commands 1 to 8
     heard = [
-        Heard(arrival_ns=1_500_000, tick=70, server_time_ns=1_300_000, sequence=1, input_age_ns=100_000),
-        Heard(arrival_ns=3_200_000, tick=71, server_time_ns=2_300_000, sequence=2, input_age_ns=0),  # late
-        Heard(arrival_ns=3_600_000, tick=72, server_time_ns=3_300_000, sequence=2, input_age_ns=MS),  # held
-        Heard(
+        ReceivedForce(
+            arrival_ns=1_500_000, tick=70, server_time_ns=1_300_000, sequence=1, input_age_ns=100_000
+        ),
+        ReceivedForce(
+            arrival_ns=3_200_000, tick=71, server_time_ns=2_300_000, sequence=2, input_age_ns=0
+        ),  # late
+        ReceivedForce(
+            arrival_ns=3_600_000, tick=72, server_time_ns=3_300_000, sequence=2, input_age_ns=MS
+        ),  # held
+        ReceivedForce(
             arrival_ns=4_500_000, tick=73, server_time_ns=4_300_000, sequence=4, input_age_ns=0
         ),  # 3 superseded
-        Heard(arrival_ns=6_500_000, tick=75, server_time_ns=6_300_000, sequence=6, input_age_ns=0),  # 74 lost
+        ReceivedForce(
+            arrival_ns=6_500_000, tick=75, server_time_ns=6_300_000, sequence=6, input_age_ns=0
+        ),  # 74 lost
     ]
     trace = trace_of(sent, heard)
     np.testing.assert_array_equal(trace.device_ns, sent)

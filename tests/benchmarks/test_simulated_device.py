@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from device_trace import Trace, steady_trace, trace_of
 from palpate.model_file import ReducedModel, StateSpace
-from palpate_server.diagnostics.round_trips import Heard
+from palpate_server.diagnostics.round_trips import ReceivedForce
 from palpate_server.realtime import shared_memory
 from simulated_device import Handle, comes_to_rest, press
 
@@ -113,7 +113,7 @@ def test_a_measured_trace_with_an_even_delay_gives_exactly_what_that_delay_gives
     sent = [k * 1_000_000 for k in range(800)]
     # Half a millisecond before the device's tick at which the force is the newest, in a server long since started.
     heard = [
-        Heard(sent_ns + late * 1_000_000 - 500_000, 5000 + k, sent_ns + 200_000, k + 1, 50_000)
+        ReceivedForce(sent_ns + late * 1_000_000 - 500_000, 5000 + k, sent_ns + 200_000, k + 1, 50_000)
         for k, sent_ns in enumerate(sent)
     ]
     measured = press(make_spring_mass_model(), HANDLE, REACH_M[:800], trace_of(sent, heard), 4.0)

@@ -1,4 +1,4 @@
-"""Measures whether this machine can serve forces to a hand: gives a verdict and says what to change.
+"""Measure whether this machine can run a server at 1 kHz: a verdict, and what to change.
 
     palpate check-host [--seconds 10] [--json]
 
@@ -24,7 +24,7 @@ from pathlib import Path
 
 import zenoh
 
-import palpate_server.session.server  # noqa: F401, runs in other processes: what it lacks is said at the start
+import palpate_server.session.server  # noqa: F401, it runs in a child process; a missing package is found here, at the start
 from palpate.model_file import save_model
 from palpate_client.arguments import positive
 from palpate_client.connection import open_session
@@ -39,15 +39,14 @@ GOOD, MARGINAL, NOT_SUFFICIENT = "good", "marginal", "not sufficient"
 _PING_PONG_S = 3.0
 _LOAD_S = 5.0
 _LONGEST_S = 3600.0
-_COMMAND_BYTES, _FORCE_BYTES = 90, 220
-
+_COMMAND_BYTES, _FORCE_BYTES = 90, 220  # of messages for one tool
 
 Value = float | str | bool | None
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One measurement: as text and as values with their units in the names, its verdict, and what to do if not good."""
+    """One result: as text, as values with the unit in their names, its verdict, and advice for when it is not good."""
 
     name: str
     text: str
@@ -58,7 +57,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Bounds:
-    """A value up to `good` is good, up to `marginal` marginal, above not sufficient."""
+    """Values up to `good` are good, up to `marginal` marginal, and above not sufficient."""
 
     good: float
     marginal: float
@@ -69,14 +68,14 @@ class Bounds:
         return MARGINAL if value <= self.marginal else NOT_SUFFICIENT
 
 
-# A hand feels what happens within a few milliseconds; a tick has one.
+# A hand feels delays of a few milliseconds; a tick takes one.
 TIMER_LATENESS_P99_S = Bounds(100e-6, 500e-6)
 ROUND_TRIP_P99_S = Bounds(1e-3, 3e-3)
-UNANSWERED_SHARE = Bounds(0.01, 0.1)  # of commands: lost, or replaced by a newer one before a tick
+UNANSWERED_SHARE = Bounds(0.01, 0.1)  # of commands: lost, or superseded before a tick used them
 LATE_SHARE = Bounds(0.001, 0.01)
 SKIPPED_SHARE = Bounds(0.0, 0.001)
 LOAD_PER_CPU = 0.3
-SILENCE_IN_LEASES = Bounds(0.25, 0.75)  # a link is lost after one
+SILENCE_IN_LEASES = Bounds(0.25, 0.75)  # after a silence of one lease the link is lost
 
 
 def worst(verdicts: Sequence[str]) -> str:
@@ -84,7 +83,7 @@ def worst(verdicts: Sequence[str]) -> str:
 
 
 def settings() -> list[Finding]:
-    """What the kernel and this user's limits allow. A setting alone never makes a machine insufficient."""
+    """Settings of the kernel and limits of the user. A setting is never worse than marginal."""
     cpus = len(os.sched_getaffinity(0))
     load = os.getloadavg()[0] / cpus
     real_time = _read("/sys/kernel/realtime") == "1"
@@ -130,13 +129,14 @@ def _try_priority() -> str | None:
 
 
 def transport_round_trip(seconds: float = _PING_PONG_S) -> list[Finding]:
+    """A bare Zenoh ping/pong with messages as large as commands and forces."""
     trips = ping_pong(_COMMAND_BYTES, _FORCE_BYTES, seconds)
     advice = "stop other programs; check what else uses the loopback device"
     return [_round_trip("Zenoh round trip", trips, advice), _unanswered("unanswered pings", trips, advice)]
 
 
 def tick_run(seconds: float) -> list[Finding]:
-    """A real server, a client at 1 kHz and a surface viewer."""
+    """A server with a sample model, a client at 1 kHz and a viewer of the surface."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "sample.npz"
         save_model(spring_mass_model(n_modes=50), path)
@@ -160,9 +160,9 @@ def tick_run(seconds: float) -> list[Finding]:
 
 
 def under_load(seconds: float = _LOAD_S) -> Finding:
-    """Whether a client keeps the link to a server beside busy loops, as many as processors, in sessions of their own.
+    """Whether a client keeps its link to a server beside one busy loop for each processor, each in a process session of its own.
 
-    The longest silence is that of the forces, as the client receives them; its own wait for a processor is part of it.
+    The longest silence is the longest time between two forces at the client. It includes the client's own wait for a processor.
     """
     arrivals = [time.monotonic()]
     lost = threading.Event()
@@ -200,9 +200,9 @@ def under_load(seconds: float = _LOAD_S) -> Finding:
 
 @contextlib.contextmanager
 def busy_loops(number: int, longest_s: float, *, apart: bool = True) -> Iterator[None]:
-    """Keep processors busy with processes, each in a session of its own if `apart`: the kernel shares between sessions first.
+    """Run `number` busy processes, each in a process session of its own (setsid) if `apart`: the kernel shares time between sessions first.
 
-    They end after `longest_s` even if we are killed.
+    They end after `longest_s`, even if this process is killed.
     """
     loop = f"import time\nend = time.monotonic() + {longest_s}\nwhile time.monotonic() < end: pass"
     processes = []

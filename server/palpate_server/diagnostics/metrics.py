@@ -1,4 +1,4 @@
-"""A Prometheus endpoint for a running server, in a process of its own so that no scrape can stall the loop.
+"""A Prometheus endpoint for a running server. It is a process of its own, so that no scrape can delay the loop.
 
 python -m palpate_server.diagnostics.metrics [--connect ENDPOINT] [--session NAME] [--port 9464]
 """
@@ -26,21 +26,21 @@ _COUNTERS = {
     "ticks": "model steps",
     "ticks_on_arrival": "ticks that a command triggered",
     "late_ticks": "ticks that began more than a quarter of a period late",
-    "caught_up_ticks": "missed ticks that were made up for",
-    "skipped_ticks": "missed ticks that were not",
+    "caught_up_ticks": "missed ticks that were run later",
+    "skipped_ticks": "missed ticks that were never run",
     "faults": "forces that were not finite",
-    "lost_clients": "clients that were gone without releasing what they held",
+    "lost_clients": "clients that disappeared while they held a tool",
     "accepted": "commands carried out",
 }
 _DURATIONS = ("timer_lateness_s", "tick_lateness_s", "compute_time_s", "input_age_s")
 _RATES = {
     "success_rate": "share of the last 100 ticks with a new command in time",
-    "success_rate_since_start": "share of the ticks with a client that had a new command in time",
+    "success_rate_since_start": "share of the ticks of a tool with a command that had a new one in time",
 }
 
 
 class StatusCollector(Collector):
-    """Turns the newest status message into metrics when it is asked."""
+    """The newest status message as metrics."""
 
     def __init__(self) -> None:
         self.status: dict[str, Any] | None = None
@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             start_http_server(options.port, options.address)
             url = f"http://{options.address}:{options.port}/metrics"
             print(f"metrics of {connection.keys.prefix} on {url}", flush=True)
-            while True:  # until Ctrl-C; without a new status the last one may no longer hold
+            while True:  # until Ctrl-C; None, and so palpate_up 0, when no status comes for a second
                 collector.status = connection.next_status(1.0)
     except KeyboardInterrupt:
         return 0

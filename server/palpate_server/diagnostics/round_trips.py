@@ -1,4 +1,4 @@
-"""How long answers take over Zenoh at a steady rate: from a bare ping/pong, and from a served model."""
+"""Round-trip times over Zenoh at a steady rate: of a bare ping/pong, and of commands to a server."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from palpate_server.session import transport
 
 RATE_HZ = 1000
 SETTLE_S = 1.0  # the server's deadlines need a quarter of a second to settle behind the commands
-_STEP_M = (0.001, 0.002, -0.003)  # from where the tool is at rest
+_STEP_M = (0.001, 0.002, -0.003)  # of the commanded position from home_m
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class RoundTrips:
     unanswered: float
 
 
-class Heard(NamedTuple):
-    """One force message, and when the client had it; times in ns on one monotonic clock."""
+class ReceivedForce(NamedTuple):
+    """One force message and its arrival at the client; times in ns on one monotonic clock."""
 
     arrival_ns: int
     tick: int
@@ -44,7 +44,7 @@ class Heard(NamedTuple):
 
 
 def ping_pong(command_bytes: int, force_bytes: int, seconds: float) -> RoundTrips:
-    """Against a Python peer in a process of its own that does nothing but put back `force_bytes` bytes."""
+    """Round trips to a Python process that answers each message with `force_bytes` bytes."""
     endpoint = free_endpoint()
     command = [sys.executable, "-m", "palpate_server.diagnostics.round_trips", endpoint, str(force_bytes)]
     padding = bytes(command_bytes - 8)
@@ -61,7 +61,7 @@ def ping_pong(command_bytes: int, force_bytes: int, seconds: float) -> RoundTrip
 
 
 def pong(endpoint: str, size: int) -> None:
-    """The peer of `ping_pong`; runs until it is killed."""
+    """The other side of `ping_pong`: answers until it is killed."""
     with transport.open_session(endpoint, None) as session:
         publisher = session.declare_publisher("pong", **_real_time())
         padding = bytes(size - 8)
@@ -73,9 +73,9 @@ def pong(endpoint: str, size: int) -> None:
 def through_a_model(
     path: Path, tool: str, seconds: float, *, viewer: bool
 ) -> tuple[RoundTrips, dict[str, Any]]:
-    """Against a server of its own for the model in `path`, driven at one tool; and that server's last status.
+    """Round trips of commands for one tool to a new server with the model in `path`; and the server's last status.
 
-    With `viewer` the surface is received as well, 60 times a second and by the same process: more work for both.
+    With `viewer`, this process also receives the surface, 60 times a second.
     """
     sent, forces, status = driven(path, tool, seconds, viewer=viewer)
     return answered(sent, forces), status
@@ -83,11 +83,11 @@ def through_a_model(
 
 def driven(
     path: Path, tool: str, seconds: float, *, viewer: bool
-) -> tuple[list[int], list[Heard], dict[str, Any]]:
-    """When each command was sent, ns, every force of the tool, and the last status."""
+) -> tuple[list[int], list[ReceivedForce], dict[str, Any]]:
+    """As `through_a_model`, unprocessed: when each command was sent, ns; every force of the tool; the last status."""
     endpoint = free_endpoint()
     command = [sys.executable, "-m", "palpate_server", str(path), "--listen", endpoint, "--surface-hz", "60"]
-    forces: list[Heard] = []
+    forces: list[ReceivedForce] = []
     statuses: list[dict[str, Any]] = []
     with running(command, "serving"), Connection(endpoint) as connection:
         index = connection.description.index(tool)
@@ -99,7 +99,9 @@ def driven(
             with contextlib.suppress(MalformedMessage):
                 force = unpack(payload, Kind.FORCE)
                 sequence, age_ns = force["sequence"][index], force["input_age_ns"][index]
-                forces.append(Heard(arrival_ns, force["tick"], force["server_time_ns"], sequence, age_ns))
+                forces.append(
+                    ReceivedForce(arrival_ns, force["tick"], force["server_time_ns"], sequence, age_ns)
+                )
 
         acquired = connection.control("acquire", tools=[tool])["tools"][tool]
         position_m = [home + step for home, step in zip(acquired["home_m"], _STEP_M, strict=True)]
@@ -113,7 +115,7 @@ def driven(
     return sent, forces, statuses[-1]
 
 
-def answered(sent: Sequence[int], forces: Sequence[Heard]) -> RoundTrips:
+def answered(sent: Sequence[int], forces: Sequence[ReceivedForce]) -> RoundTrips:
     """The round trips of what `driven` gives."""
     return _match(sent, [(force.sequence, force.arrival_ns) for force in forces])
 
@@ -144,9 +146,9 @@ def _drive(
     receive: Callable[[int, bytes], None],
     seconds: float,
 ) -> list[int]:
-    """Send commands 1, 2, ... at RATE_HZ to one key and hand on each answer of another; when each was sent, ns.
+    """Send commands 1, 2, ... at RATE_HZ to the first key, and call `receive` with each answer on the second.
 
-    What is sent while settling is measured too: `_match` leaves it out.
+    Returns when each command was sent, ns. The commands of the first SETTLE_S are included; `_match` ignores them.
     """
     send_key, answer_key = keys
     subscriber = session.declare_subscriber(
@@ -169,7 +171,13 @@ def _drive(
 
 
 def _match(sent: Sequence[int], answers: Sequence[tuple[int, int]]) -> RoundTrips:
-    """sent: when command 1, 2, ... was; answers: of which command, and when it came; ns. Raises ServerGone without any."""
+    """The round trips of the commands after SETTLE_S.
+
+    sent     when command 1, 2, ... was sent, ns
+    answers  (command, arrival in ns) of each answer; only the first to a command counts
+
+    Raises ServerGone without any answer.
+    """
     trips: dict[int, int] = {}
     for sequence, arrival_ns in answers:
         if sequence > SETTLE_S * RATE_HZ:
