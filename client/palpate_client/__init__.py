@@ -1,4 +1,4 @@
-"""A client's side of palpate: connection, tools and decoders. Needs eclipse-zenoh and msgpack alone.
+"""The client library: connection, tools and decoders. It needs eclipse-zenoh and msgpack only.
 
 with Connection() as connection, Tool(connection) as tool:
     tool.move(tool.at_depth(0.003))
@@ -26,6 +26,7 @@ from palpate_client.messages import (
     decode_surface,
 )
 from palpate_client.tool import OneSidedContact, Tool
+from palpate_client.wire import MalformedMessage
 
 __all__ = [
     "ClientError",
@@ -37,6 +38,7 @@ __all__ = [
     "Frame",
     "Geometry",
     "Incompatible",
+    "MalformedMessage",
     "OneSidedContact",
     "Refused",
     "ServerGone",

@@ -1,4 +1,4 @@
-"""What the programs that connect to a server have in common on their command lines."""
+"""Command line options that all programs with a connection have."""
 
 from __future__ import annotations
 

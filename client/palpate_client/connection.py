@@ -1,4 +1,4 @@
-"""A client's Zenoh session with one server: opened and closed, the server's presence watched, questions asked, messages received."""
+"""A client's connection to one server: opens and closes it, watches the server's token, sends requests, receives messages."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from palpate_client.messages import (
     Geometry,
     Surface,
     decode_geometry,
-    force_of,
     read_description,
+    read_force,
     read_surface,
 )
 
@@ -68,7 +68,7 @@ class Connection:
         self._stopping = threading.Event()
         self._status_came = threading.Event()
         self.status: dict[str, Any] | None = None  # the newest
-        self._kept: list[object] = []  # Zenoh ends what is no longer referenced
+        self._kept: list[object] = []  # references: Zenoh undeclares what is garbage-collected
         self._sequence = 0
         self._zenoh: zenoh.Session | None = None
         self._description: Description | None = None
@@ -99,7 +99,7 @@ class Connection:
 
     @property
     def description(self) -> Description:
-        """What the server said of itself when we joined, or joined again."""
+        """The server's answer to `describe` at the last agreement."""
         if self._description is None:
             raise RuntimeError("the connection is not open: use it in a `with` statement")
         return self._description
@@ -107,11 +107,11 @@ class Connection:
     # The server's presence
 
     def check(self) -> None:
-        """Raises ServerGone once the server, or the link to it, has gone, or when the server says that it stops."""
-        if self._stopping.is_set():  # said before it goes
+        """Raises ServerGone if the server or the link to it is gone, or if the server says that it is stopping."""
+        if self._stopping.is_set():
             raise ServerGone("the server is stopping")
         if self._gone.is_set():
-            raise ServerGone("the server is gone, or the link to it: its liveliness token was taken back")
+            raise ServerGone("the server is gone, or the link to it: its liveliness token was deleted")
 
     def reconnect(self, timeout_s: float) -> None:
         """Wait until a server is there (again) and agree with it anew; tools have to be acquired again.
@@ -123,7 +123,7 @@ class Connection:
         if self.description.config_sha256 != before:
             raise Incompatible("the server that came back serves another model")
 
-    # Questions
+    # Requests
 
     def ask(
         self, key: str, fields: Mapping[str, Any] | None = None, *, timeout_s: float = QUERY_TIMEOUT_S
@@ -175,11 +175,11 @@ class Connection:
         position_m: Mapping[str, list[float]],
         velocity_m_per_s: Mapping[str, list[float]] | None = None,
         rendered_tick: int | None = None,
-        before_it_leaves: Callable[[int, int], None] | None = None,
+        on_sending: Callable[[int, int], None] | None = None,
     ) -> int:
         """Send a command: position, m, and velocity, m/s, of tools by name, in the frame that was acquired; its sequence.
 
-        before_it_leaves(sequence, client_time_ns) is called before the answer can come.
+        on_sending(sequence, client_time_ns) is called right before it is sent.
         """
         self._sequence += 1
         sequence, now_ns = self._sequence, time.monotonic_ns()
@@ -191,8 +191,8 @@ class Connection:
             "velocity_m_per_s": velocity_m_per_s,
             "rendered_tick": rendered_tick,
         }
-        if before_it_leaves is not None:
-            before_it_leaves(sequence, now_ns)
+        if on_sending is not None:
+            on_sending(sequence, now_ns)
         self._commands.put(wire.pack(command))
         return sequence
 
@@ -221,9 +221,9 @@ class Connection:
         return self.on_message(self.keys.force, wire.Kind.FORCE, receive)
 
     def on_tool_force(self, tool: str, receive: Callable[[Force], None]) -> Subscription:
-        """Call receive(force) for every tick, with what it did with one tool. Raises ValueError when there is none."""
+        """Call receive(force) with one tool's force of every tick. Raises ValueError if there is no such tool."""
         index = self.description.index(tool)
-        return self.on_force(lambda message, at: receive(force_of(message, index, at)))
+        return self.on_force(lambda message, at: receive(read_force(message, index, at)))
 
     def on_status(self, receive: Callable[[dict[str, Any]], None]) -> Subscription:
         """Call receive(message) for every status, some ten a second."""
@@ -241,14 +241,13 @@ class Connection:
         )
 
     def _join(self) -> None:
-        # The token is our sign of life: when it goes, because we are killed or cut off, the server takes our tools back
-        # and lets their force fade.
+        # When our token is deleted, because we are killed or cut off, the server frees our tools and lets their forces fade.
         liveliness = self.zenoh.liveliness()
         self._kept.append(liveliness.declare_token(self.keys.client(self.name)))
-        # The server's token tells that it is there, and that it is gone sooner than any timeout.
+        # The server's token says that it is there, and its deletion comes sooner than any timeout.
         self._kept.append(liveliness.declare_subscriber(self.keys.server, self._on_server, history=True))
         self.on_status(self._on_status)
-        # A command is worth nothing when late: no batching, and drop instead of wait.
+        # A late command is useless: do not batch, and drop instead of waiting.
         self._commands = self.zenoh.declare_publisher(
             self.keys.command(self.name),
             priority=zenoh.Priority.REAL_TIME,
@@ -271,7 +270,7 @@ class Connection:
             self._stopping.set()
 
     def _agree(self, timeout_s: float) -> None:
-        """Wait for a server, and take up what it says of itself."""
+        """Wait for a server, ask it for its description, and keep that."""
         if not self._there.wait(timeout_s):
             raise ServerGone(f"no server for {self.keys.prefix} at {self.place} within {timeout_s:g} s")
         self._stopping.clear()
@@ -298,7 +297,7 @@ class Connection:
 
 
 def open_session(endpoint: str, zenoh_config: str | Path | None = None) -> zenoh.Session:
-    """A Zenoh session with a client's settings, or with exactly those of a file; close it.
+    """A Zenoh session with a client's settings, or with exactly those of a file. The caller closes it.
 
     Raises ConfigurationError, or ServerGone when nothing answers there.
     """
@@ -325,10 +324,10 @@ def _configuration(endpoint: str, zenoh_config: str | Path | None) -> zenoh.Conf
         "connect/endpoints": [endpoint],
         "connect/timeout_ms": 2000,
         "connect/exit_on_failure": True,
-        # After a loss of the link: try again soon.
+        # Reconnect soon after a loss of the link.
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         "transport/unicast/open_timeout": 2000,
-        # The server's place is known; scouting would only find others.
+        # The endpoint is known, so scouting is not needed.
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": wire.LEASE_MS,
@@ -339,7 +338,7 @@ def _configuration(endpoint: str, zenoh_config: str | Path | None) -> zenoh.Conf
 
 
 def _words(error: zenoh.ZError) -> str:
-    """Zenoh's words without the places in its source."""
+    """Zenoh's message without the source locations."""
     return re.split(r" at /", str(error), maxsplit=1)[0]
 
 

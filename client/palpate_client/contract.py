@@ -1,4 +1,4 @@
-"""What a client may rely on, checked message by message, and the round-trip times that follow from it."""
+"""Checks every force against what the server promises, and measures round-trip times."""
 
 from __future__ import annotations
 
@@ -10,18 +10,22 @@ from palpate_client.messages import Description, Force
 from palpate_client.wire import LEASE_MS, Flags
 
 ROUNDING_N = 1e-9
-REMEMBERED = 10_000  # commands: an answer to an older one breaks the contract anyway
-# A busy machine or network may delay commands until the force has faded. The flags tell, and nobody has promised to prevent
-# it. Zenoh closes a link on which nothing moves for this long, so a longer silence has another cause.
-UNHEARD_NS = LEASE_MS * 1_000_000
-MOST_BREAKS_TOLD = 20  # one cause can break every tick; the first ones tell
+REMEMBERED = 10_000  # commands; an answer to an older one breaks the contract
+# A busy machine or network may delay commands until the force has faded. The flags say so, and the contract allows it. Zenoh
+# closes a link that is silent for this long. So if forces stay faded for longer although we send, something else is wrong.
+LONGEST_OUTAGE_NS = LEASE_MS * 1_000_000
+MAX_BREAKS_LISTED = 20  # one cause can break the contract in every tick
 
 
 class Contract:
-    """Checks the forces of one tool against what the server promises, and against the commands that were sent."""
+    """Checks the forces of one tool against the server's promises and against the commands that were sent.
+
+    holding  whether we hold the tool, as far as we know
+    broken   how the contract was broken, the first MAX_BREAKS_LISTED times
+    """
 
     def __init__(self, description: Description) -> None:
-        self.holding = False  # the tool, as far as we know
+        self.holding = False
         self.broken: list[str] = []
         self.forces_received = 0
         self.forces_lost = 0
@@ -40,20 +44,20 @@ class Contract:
         self._last: Force | None = None
         self._newest_sent_ns = 0
         self._sending_since_ns = 0  # without a pause in which our force would fade
-        self._unheard = False
+        self._in_outage = False
 
     def acquired(self, max_force_n: float) -> None:
-        """`acquire` was granted: from now on the tool is ours, with this limit of the force."""
+        """Call it when `acquire` was granted, with the limit of the force."""
         self._max_force_n = max_force_n
         self._newest_answered = -1
         self.holding = True
 
     def released(self) -> None:
-        """Call it before the tool is released or acquired again: the server then forgets our commands rightly."""
+        """Call it before the tool is released or acquired again: after that the server may forget our commands."""
         self.holding = False
 
-    def on_sent(self, sequence: int, client_time_ns: int) -> None:
-        """Call it before the command is sent: the answer may come before `put` returns."""
+    def on_sending(self, sequence: int, client_time_ns: int) -> None:
+        """Call it right before a command is sent: the answer may come before `put` returns."""
         if client_time_ns - self._newest_sent_ns > self._fade_ns:
             self._sending_since_ns = client_time_ns
         self._newest_sent_ns = client_time_ns
@@ -62,7 +66,7 @@ class Contract:
         self._sent.pop(sequence - REMEMBERED, None)
 
     def on_force(self, force: Force) -> bool:
-        """True when nothing about this force breaks the contract: only then may it be rendered, and only while holding."""
+        """Check a force. True if it keeps the contract: it may be rendered only then, and only while `holding`."""
         breaks = self._breaks
         self.forces_received += 1
         for flag in Flags:
@@ -73,15 +77,16 @@ class Contract:
         return self._breaks == breaks
 
     def measure_anew(self) -> None:
-        """Round trips that were measured until now do not count."""
+        """Forget the round trips that were measured so far."""
         self._round_trips_ns = array("q")
 
     def round_trip_s(self, share: float) -> float | None:
-        """Time below which this share of the round trips lies, s; None without one."""
+        """The percentile of the round trips for a share of 0 to 1, s; None if there is none."""
         ordered = sorted(self._round_trips_ns)
         return ordered[min(len(ordered) - 1, int(share * len(ordered)))] * 1e-9 if ordered else None
 
     def summary(self) -> dict[str, Any]:
+        """All counts, percentiles of the round trip (s), flags (ticks) and breaks, as `palpate client --json` prints them."""
         shares = {"p50": 0.5, "p99": 0.99, "p99_9": 0.999, "max": 1.0}
         return {
             "commands_sent": self.commands_sent,
@@ -96,7 +101,7 @@ class Contract:
         }
 
     def _check_value(self, force: Force) -> bool:
-        """False when nothing more can be said of this force."""
+        """Check force, limits and age. False if the order and the answer of this force can't be checked."""
         if not all(math.isfinite(f) for f in force.force_n):
             self._break(force, f"the force {list(force.force_n)} is not finite")
             return False
@@ -119,7 +124,7 @@ class Contract:
         return True
 
     def _check_order(self, force: Force) -> bool:
-        """False for a force that came too late."""
+        """Check the order of ticks and answers, and the change of the force. False for a force that came too late."""
         last = self._last
         if last is not None:
             if force.tick <= last.tick:
@@ -144,30 +149,32 @@ class Contract:
                 self.commands_answered += 1
                 self._round_trips_ns.append(force.arrival_ns - sent_ns)
             if self.holding:
-                self._check_heard(force, sent_ns)
-        elif self.holding and force.sequence >= 0:  # without the tool, the answers are to other clients
+                self._check_outage(force, sent_ns)
+        elif (
+            self.holding and force.sequence >= 0
+        ):  # while we do not hold the tool, the answers are to other clients
             self._lose(
                 force,
                 f"we no longer hold the tool: it answers command {force.sequence}, which was not sent "
                 "(or not at that time)",
             )
 
-    def _check_heard(self, force: Force, sent_ns: int) -> None:
-        """A force may fade when we were silent, but not while we went on sending.
+    def _check_outage(self, force: Force, sent_ns: int) -> None:
+        """Check that the force has not stayed faded for LONGEST_OUTAGE_NS while we sent commands.
 
-        All times are on our clock: the tick began `input_age_ns` or more after its command was sent. The time of arrival says
-        nothing: the message may have waited while we were paused.
+        All times are on our clock. The tick began at least `input_age_ns` after its command was sent. The message's time of
+        arrival is not used: it may have waited while this process was paused.
         """
         end_ns = min(sent_ns + force.input_age_ns, self._newest_sent_ns)
-        unheard_ns = end_ns - max(sent_ns, self._sending_since_ns)
-        unheard = bool(force.flags & Flags.STALE) and unheard_ns > UNHEARD_NS
-        if unheard and not self._unheard:
+        outage_ns = end_ns - max(sent_ns, self._sending_since_ns)
+        in_outage = bool(force.flags & Flags.STALE) and outage_ns > LONGEST_OUTAGE_NS
+        if in_outage and not self._in_outage:
             self._break(
                 force,
-                f"the force has faded although we went on sending: for {unheard_ns / 1e9:.3g} s no command of ours "
+                f"the force has faded although we went on sending: for {outage_ns / 1e9:.3g} s no command of ours "
                 "has arrived, or they are refused",
             )
-        self._unheard = unheard
+        self._in_outage = in_outage
 
     def _lose(self, force: Force, what: str) -> None:
         self.holding = False
@@ -176,5 +183,5 @@ class Contract:
 
     def _break(self, force: Force, what: str) -> None:
         self._breaks += 1
-        if len(self.broken) < MOST_BREAKS_TOLD:
+        if len(self.broken) < MAX_BREAKS_LISTED:
             self.broken.append(f"tick {force.tick}: {what}")

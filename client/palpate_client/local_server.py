@@ -1,4 +1,4 @@
-"""A program on this machine, such as a server, from the line that says that it is ready to its end."""
+"""Start a program on this machine, such as a server; wait until it is ready; end it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def free_endpoint() -> str:
 
 @contextlib.contextmanager
 def running(command: list[str], ready: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The process, and the line beginning with `ready` that it printed; it is ended on the way out, whatever happens.
+    """Start a process and wait for a line that begins with `ready`: the process and that line. It is ended on the way out.
 
     Raises ServerGone when it ends before that line or takes too long.
     """

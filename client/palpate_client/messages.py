@@ -98,7 +98,7 @@ def read_description(message: Mapping[str, Any]) -> Description:
 
 
 class Force(NamedTuple):
-    """What one tick did with one tool; the fields are those of docs/wire.md.
+    """One tool's part of a force message; the fields are those of docs/wire.md.
 
     position_m: where the tip was applied, m, in the client's frame.
     force_n: what the device renders, N, in the client's frame: the force of the tissue on the tool.
@@ -118,8 +118,8 @@ class Force(NamedTuple):
     arrival_ns: int
 
 
-def force_of(message: Mapping[str, Any], index: int, arrival_ns: int) -> Force:
-    """What a decoded force message says of the tool at `index`."""
+def read_force(message: Mapping[str, Any], index: int, arrival_ns: int) -> Force:
+    """The force of the tool at `index` in a decoded message."""
     return Force(
         message["tick"],
         message["server_time_ns"],

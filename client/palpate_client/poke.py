@@ -1,4 +1,4 @@
-"""Poke a served model without a device: move one tool, check every force, print what it was like.
+"""Poke a served model without a device: move one tool, check every force, print a summary.
 
 Exit code 0: all well. 1: the contract was broken, the tool was lost or the server went away. 2: it could not start.
 3: the file of --record could not be written. 130: Ctrl-C.
@@ -118,7 +118,7 @@ def not_carried_out(before: dict[str, Any] | None, after: dict[str, Any] | None)
 
 
 def wrote(path: str, description: Description, messages: list[dict[str, Any]]) -> bool:
-    """Write every tick that was heard as CSV: where each tool was applied, and its force. False, and a line, when it can't."""
+    """Write every received tick as CSV: position and force of each tool. False, with a message, if it can't be written."""
     from palpate.files import write_atomically
 
     table = io.StringIO(newline="")

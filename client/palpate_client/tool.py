@@ -1,4 +1,4 @@
-"""A tool: held from entering to leaving, moved by commands, felt by forces."""
+"""A tool of a connection: acquire it, move it, take its force, release it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from palpate_client.errors import ServerGone, ToolLost
 from palpate_client.messages import Force, Frame, Vector
 
 NO_FORCE: Vector = (0.0, 0.0, 0.0)
-SETTLE_S = 0.5  # the server's deadlines follow our commands within a quarter of a second
-MEASURE_S = 1.0
-LAST_ANSWERS_S = 0.05  # how long answers may still be under way
-FIRST_FORCE_S = 3.0
+SETTLE_S = 0.5  # until the server's deadlines follow our commands; a quarter of a second is enough
+MEASURE_S = 1.0  # how long the round trip is measured
+LAST_ANSWERS_S = 0.05  # wait for the answers to the last commands
+FIRST_FORCE_S = 3.0  # longest wait for the first force
 
 
 class Tool:
@@ -33,9 +33,9 @@ class Tool:
     ----------
     home_m: (3,) where the tip touches the undeformed tissue without pressing, m, in the client's frame.
     normal: (3,) outward normal there, of length 1, in the client's frame.
-    limits: what holds for us, by name; docs/wire.md says what they mean.
-    warnings: the server's, for the user.
-    contract: what the server promises, checked for every force.
+    limits: the agreed limits by name; see "Limits" in docs/wire.md.
+    warnings: the server's warnings, to be shown to the user.
+    contract: checks every force, and counts.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Tool:
         self.limits: dict[str, float] = {}
         self.warnings: list[str] = []
         self.contract = Contract(connection.description)
-        self.newest: Force | None = None  # that keeps the contract
+        self.newest: Force | None = None  # the newest force that keeps the contract
         self._connection = connection
         self._silence_s = silence_s
         self._since_s = time.monotonic()
@@ -79,13 +79,13 @@ class Tool:
             if not lost:
                 self._connection.control("release")
         except ServerGone:
-            if error is None:  # otherwise the first error tells more
+            if error is None:  # otherwise the first error is more useful
                 raise
 
     def move(self, position_m: Sequence[float], velocity_m_per_s: Sequence[float] | None = None) -> None:
-        """Send where the tip is, m, and how fast it moves, m/s, in our frame: best once each period.
+        """Send the tip's position, m, and its velocity, m/s, in our frame: once each period.
 
-        With the velocity, the server carries the motion on when a command is late. Raises ServerGone or ToolLost: a device
+        With a velocity, the server continues the motion for up to 5 ms when a command is late. Raises ServerGone or ToolLost: a device
         renders zero from then on.
         """
         self._connection.check()
@@ -96,13 +96,13 @@ class Tool:
             raise ServerGone(f"the server is silent: no force for {self.silent_s:.3g} s")
         velocity = None if velocity_m_per_s is None else {self.name: list(velocity_m_per_s)}
         self._connection.send(
-            {self.name: list(position_m)}, velocity, self._rendered_tick, self.contract.on_sent
+            {self.name: list(position_m)}, velocity, self._rendered_tick, self.contract.on_sending
         )
 
     def take_force(self) -> Vector:
-        """What a device renders now, N, in our frame: the newest force while it is fresh, and zero otherwise.
+        """The force to render now, N, in our frame: the newest one while it is fresh, otherwise zero.
 
-        Zero before the first force, when none that keeps the contract has come for `hold_s`, and when the tool or the
+        It is zero before the first force, when no force that keeps the contract has come for `hold_s`, and when the tool or the
         server is lost. The next command tells the server which force was rendered.
         """
         force = self.newest
@@ -157,7 +157,7 @@ class Tool:
         self.contract.acquired(self.limits["max_force_n"])
 
     def _on_force(self, force: Force) -> None:
-        if self.contract.on_force(force):  # what may not be rendered counts as silence
+        if self.contract.on_force(force):  # a force that breaks the contract is as good as none
             self._since_s = force.arrival_ns * 1e-9
             self.newest = force
 
@@ -177,7 +177,7 @@ class OneSidedContact:
         self._entered: Sequence[float] = tool.home_m  # where the hand went in, on the undeformed surface
 
     def tip(self, position_m: Sequence[float]) -> tuple[list[float], bool]:
-        """Where the tip is for a hand at a position, m, in our frame; and whether it touches."""
+        """The tip's position for the hand's position, m, in our frame; and whether the tip touches the tissue."""
         home, normal = self._tool.home_m, self._tool.normal
         depth = sum((h - p) * n for h, p, n in zip(home, position_m, normal, strict=True))
         silent = self._tool.silent_s > self._hold_s

@@ -1,7 +1,7 @@
-"""Facts of the wire: schema version, keys, kinds, fields, reasons, flags and bounds, and the packing of a message.
+"""The definitions of the wire: schema version, keys, kinds, fields, reasons, flags and bounds; and packing of messages.
 
-The server and the Python clients take them from here. `docs/wire.md` tells the same to people who write clients in other
-languages; a test compares the two. This module needs msgpack and the standard library, and nothing else.
+The server and the Python clients use them. `docs/wire.md` describes the same for clients in other languages; a test compares
+the two. This module needs msgpack and the standard library only.
 
 Every payload is one msgpack map whose first field is `kind`. Quantities are SI and carry their unit in the field's name.
 Times are nanoseconds on the sender's own monotonic clock. Vectors are `[x, y, z]`.
@@ -21,8 +21,8 @@ ENCODING = f"application/msgpack;palpate.v{SCHEMA_VERSION}"
 DEFAULT_SESSION = "main"
 RECORDER = "recorder"  # the client that may record without a tool
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-# Zenoh's lease on a link, ms: a peer that stays silent for longer counts as gone. It sends KEEP_ALIVES messages in that time
-# at least, so its threads may wait 3.5 s for a processor; those of ordinary priority waited up to 2.4 s on a busy machine.
+# Zenoh's lease on a link, ms: a peer that is silent for longer counts as gone. It sends at least KEEP_ALIVES messages in that
+# time, so its threads may wait 3.5 s for a processor; at ordinary priority they waited up to 2.4 s on a busy machine.
 LEASE_MS = 4000
 KEEP_ALIVES = 8
 
@@ -184,7 +184,7 @@ def unpack_map(payload: bytes, max_bytes: int) -> dict[str, Any]:
         message = msgpack.unpackb(payload, raw=False, strict_map_key=True)
     except (ValueError, RecursionError, OverflowError) as error:
         raise MalformedMessage("not_msgpack", f"payload is not one msgpack value ({error})") from error
-    except Exception as error:  # the decoder is fed whatever the network brings
+    except Exception as error:  # the payload can be anything
         raise MalformedMessage("not_msgpack", f"payload can't be decoded ({error!r})") from error
     if type(message) is not dict:
         raise MalformedMessage("not_a_map", f"payload is a {type(message).__name__}: expected a map")
@@ -207,6 +207,6 @@ def check_kind(message: Mapping[str, Any], kind: Kind) -> None:
 
 
 def check_size(n_bytes: int, max_bytes: int) -> None:
-    """Raises MalformedMessage when a payload is larger than it may be: ask before it is copied or decoded."""
+    """Raises MalformedMessage if a payload is too large. Call it before the payload is copied or decoded."""
     if n_bytes > max_bytes:
         raise MalformedMessage("too_large", f"payload has {n_bytes} bytes: expected at most {max_bytes}")

@@ -111,7 +111,7 @@ class Contract {
     void release() { holding_ = false; }
 
     // Call it before the command is sent: the answer may come before the sending returns.
-    void on_sent(std::int64_t sequence, std::int64_t client_time_ns) {
+    void on_sending(std::int64_t sequence, std::int64_t client_time_ns) {
         if (static_cast<double>(client_time_ns - newest_sent_ns_) > fade_ns_) sending_since_ns_ = client_time_ns;
         newest_sent_ns_ = client_time_ns;
         sent_[index(sequence)] = {sequence, client_time_ns};
@@ -144,7 +144,7 @@ class Contract {
     static constexpr std::size_t told = 20;             // one cause can break every tick; the first ones tell
     // A busy machine or network may delay commands until the force has faded. The flags tell, and nobody has promised
     // to prevent it. Zenoh closes a link on which nothing moves for this long, so a longer silence has another cause.
-    static constexpr std::int64_t unheard_limit_ns = 4'000'000'000;
+    static constexpr std::int64_t longest_outage_ns = 4'000'000'000;
 
     struct Sent {
         std::int64_t sequence = -1, client_time_ns = 0;
@@ -210,7 +210,7 @@ class Contract {
                 ++answered_;
                 round_trips_.add(f.arrival_ns - sent.client_time_ns);
             }
-            if (holding_) check_heard(f, sent.client_time_ns);
+            if (holding_) check_outage(f, sent.client_time_ns);
         } else if (holding_) {  // without the tool, the answers are to other clients
             lose();
             broke(f.tick,
@@ -222,18 +222,18 @@ class Contract {
     // That the force has faded is our own doing when we were silent, but not while we went on sending. All
     // times are on our clock: the tick began `input_age_ns` or more after its command was sent. When the
     // message comes says nothing: it may have waited while we were paused.
-    void check_heard(const Force& f, std::int64_t sent_ns) {
+    void check_outage(const Force& f, std::int64_t sent_ns) {
         const std::int64_t end_ns = std::min(sent_ns + f.input_age_ns, newest_sent_ns_);
-        const std::int64_t unheard_ns = end_ns - std::max(sent_ns, sending_since_ns_);
-        const bool unheard = (f.flags & stale_) && unheard_ns > unheard_limit_ns;
-        if (unheard && !unheard_) {
+        const std::int64_t outage_ns = end_ns - std::max(sent_ns, sending_since_ns_);
+        const bool in_outage = (f.flags & stale_) && outage_ns > longest_outage_ns;
+        if (in_outage && !in_outage_) {
             broke(f.tick,
                   "the force has faded although we went on sending: for %.3g s no command of ours has "
                   "arrived, or they "
                   "are refused",
-                  static_cast<double>(unheard_ns) / 1e9);
+                  static_cast<double>(outage_ns) / 1e9);
         }
-        unheard_ = unheard;
+        in_outage_ = in_outage;
     }
 
     void lose() {
@@ -254,7 +254,7 @@ class Contract {
 
     std::int64_t decaying_, stale_;
     double max_force_n_, max_step_n_, hold_ns_, fade_ns_;
-    bool holding_ = false, unheard_ = false;
+    bool holding_ = false, in_outage_ = false;
     std::vector<Sent> sent_ = std::vector<Sent>(remembered);
     std::int64_t commands_ = 0, answered_ = 0, forces_ = 0, lost_ticks_ = 0, newest_answered_ = -1, breaks_ = 0;
     std::int64_t newest_sent_ns_ = 0,

@@ -191,7 +191,7 @@ class Bridge {
     void send(Command command) {
         command.sequence = ++sequence_;
         command.client_time_ns = now_ns();
-        contract_.on_sent(command.sequence, command.client_time_ns);
+        contract_.on_sending(command.sequence, command.client_time_ns);
         connection_.send(command);
     }
 

@@ -50,7 +50,7 @@ class Conversation:
     def send(self, at_ms: int) -> int:
         sequence = len(self.sent_ms) + 1
         self.sent_ms[sequence] = at_ms
-        self.contract.on_sent(sequence, at_ms * MS)
+        self.contract.on_sending(sequence, at_ms * MS)
         return sequence
 
     def tick(

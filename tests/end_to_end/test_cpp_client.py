@@ -63,7 +63,7 @@ void check_contract() {{
         if (word == "sent") {{
             std::int64_t sequence, at;
             std::cin >> sequence >> at;
-            contract.on_sent(sequence, at);
+            contract.on_sending(sequence, at);
         }}
         if (word == "force") {{
             palpate::Force f;
@@ -258,7 +258,7 @@ def in_python(said: list[tuple[Any, ...]]) -> tuple[list[float], str, list[str]]
         elif word == "release":
             contract.released()
         elif word == "sent":
-            contract.on_sent(*values)
+            contract.on_sending(*values)
         else:
             tick, sequence, client_time_ns, input_age_ns, flags, x, arrival_ns = values
             message = Force(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from palpate_client import Frame, decode_geometry, decode_surface
-from palpate_client.messages import force_of, read_description
+from palpate_client.messages import read_description, read_force
 from palpate_client.wire import ACTIONS, Flags, Kind, unpack
 from palpate_server import codec
 from palpate_server.session.devices import PROFILES, stiffness_warnings
@@ -109,7 +109,7 @@ def test_the_server_encodes_geometry_and_surface_as_in_the_examples() -> None:
 
 def test_the_client_reads_the_examples_of_force_and_describe() -> None:
     message, payload = EXAMPLES["Force"]
-    force = force_of(unpack(payload, Kind.FORCE), 0, 5)
+    force = read_force(unpack(payload, Kind.FORCE), 0, 5)
     assert (force.sequence, force.force_n, force.arrival_ns) == (
         message["sequence"][0],
         message["force_n"][0],
