@@ -27,7 +27,7 @@ class LoadedSurface:
 
 
 def load_surface(path: Path, unit: LengthUnit = "m") -> LoadedSurface:
-    """Read a closed surface from an STL, OBJ or PLY file whose coordinates are in the unit.
+    """Read a closed surface from a file (STL, OBJ, PLY, OFF, VTK, VTP) whose coordinates are in the unit.
 
     Polygons are split into triangles. Vertices no further apart than `MERGE_TOLERANCE` of the body's diagonal are merged
     and unused ones dropped. Raises FileNotFoundError, and SurfaceError when the file can't be read, or with all that

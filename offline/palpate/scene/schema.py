@@ -71,7 +71,7 @@ class SurfaceGeometry(Table):
     """The inside of a closed triangle surface."""
 
     shape: Literal["surface"]
-    file: str = Field(description="STL, OBJ or PLY, relative to the configuration")
+    file: str = Field(description="STL, OBJ, PLY, OFF, VTK or VTP, relative to the configuration")
     file_unit: LengthUnit = Field(default="m", description="unit of the file's coordinates")
     spacing_m: Length
     growth: Number = Field(

@@ -1,7 +1,7 @@
-"""Surface files: STL, OBJ and PLY as polygons, each checked against the counts that the file itself states.
+"""Surface files: STL, OBJ, PLY, OFF, VTK and VTP as polygons, each checked against the counts that the file itself states.
 
-Raises `ReadError`, with the line or the count that is wrong. No library with a permissive license reads these formats
-in double precision and says where a file is wrong, so the three readers are ours.
+Raises `ReadError`, with the line or the count that is wrong. No library with a permissive license reads STL, OBJ, PLY
+and OFF in double precision and says where a file is wrong, so these readers are ours. VTK and VTP are read by VTK.
 """
 
 from __future__ import annotations
@@ -9,13 +9,23 @@ from __future__ import annotations
 from pathlib import Path
 
 from palpate.geometry.readers.obj import read_obj
+from palpate.geometry.readers.off import read_off
 from palpate.geometry.readers.ply import read_ply
 from palpate.geometry.readers.polygons import Polygons, ReadError
 from palpate.geometry.readers.stl import read_stl
+from palpate.geometry.readers.vtk_legacy import read_vtk
+from palpate.geometry.readers.vtp import read_vtp
 
 __all__ = ["READERS", "Polygons", "ReadError", "read_polygons"]
 
-READERS = {".stl": read_stl, ".obj": read_obj, ".ply": read_ply}
+READERS = {
+    ".stl": read_stl,
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".off": read_off,
+    ".vtk": read_vtk,
+    ".vtp": read_vtp,
+}
 
 
 def read_polygons(path: Path) -> Polygons:

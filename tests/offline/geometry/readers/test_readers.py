@@ -1,4 +1,4 @@
-"""Dialects of STL, OBJ and PLY that real programs write, each holding the same tetrahedron; and what damaged files get."""
+"""Dialects of surface files that real programs write, each holding the same tetrahedron; and what damaged files get."""
 
 from __future__ import annotations
 
@@ -58,6 +58,32 @@ def binary_ply(order: str) -> bytes:
     return header.encode("latin-1") + vertices + faces
 
 
+OFF = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+LEGACY = (
+    "# vtk DataFile Version 3.0\nby hand\nASCII\nDATASET POLYDATA\nPOINTS 4 float\n0 0 0 1 0 0\n0 1 0 0 0 1\n"
+    "POLYGONS 4 16\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+)
+
+
+WRITTEN_BY_VTK = Path(__file__).parents[3] / "data" / "vtk"
+"""The tetrahedron as VTK 9.7 writes it."""
+
+
+def vtp(name: str) -> bytes:
+    return (WRITTEN_BY_VTK / f"{name}.vtp").read_bytes()
+
+
+TWO_PIECES = b"""<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian"><PolyData>
+<Piece NumberOfPoints="4" NumberOfPolys="3"><Points>
+<DataArray type="Float64" NumberOfComponents="3" format="ascii">0 0 0 1 0 0 0 1 0 0 0 1</DataArray></Points><Polys>
+<DataArray type="Int32" Name="connectivity" format="ascii">0 2 1 0 1 3 0 3 2</DataArray>
+<DataArray type="UInt8" Name="offsets" format="ascii">3 6 9</DataArray></Polys></Piece>
+<Piece NumberOfPoints="3" NumberOfPolys="1"><Points>
+<DataArray type="Float32" NumberOfComponents="3" format="ascii">1 0 0 0 1 0 0 0 1</DataArray></Points><Polys>
+<DataArray type="Int32" Name="connectivity" format="ascii">0 1 2</DataArray>
+<DataArray type="UInt8" Name="offsets" format="ascii">3</DataArray></Polys></Piece>
+</PolyData></VTKFile>"""
+
 DIALECTS: dict[str, bytes] = {
     "ascii.stl": ascii_stl().encode(),
     "name in Latin-1.stl": ascii_stl("Stra\u00dfe").encode("latin-1"),
@@ -91,6 +117,13 @@ DIALECTS: dict[str, bytes] = {
     "CRLF.ply": ascii_ply().replace("\n", "\r\n").encode("latin-1"),
     "little endian.ply": binary_ply("<"),
     "big endian.ply": binary_ply(">"),
+    "plain.off": f"OFF\n4 4 6\n{OFF}".encode(),
+    "counts in the first line, no edges.off": f"OFF 4 4\n{OFF}".encode(),
+    "comments, CRLF.off": f"# by hand\nOFF # here\n\n4 4 0 # counts\n{OFF}".replace("\n", "\r\n").encode(),
+    "colors.off": f"COFF\n4 4 6\n{OFF}".replace("0 0 1\n", "0 0 1 0.5 0.5 0.5 1\n").replace("3\n", "3 255 0 0\n").encode(),
+    "by hand.vtk": LEGACY.encode(),
+    "two pieces.vtp": TWO_PIECES,
+    **{path.name: path.read_bytes() for path in sorted(WRITTEN_BY_VTK.iterdir())},
 }  # fmt: skip
 
 
@@ -101,7 +134,7 @@ def test_each_dialect_gives_the_same_faces(tmp_path: Path, name: str) -> None:
     polygons = read_polygons(path)
     np.testing.assert_array_equal(polygons.sizes, [3, 3, 3, 3])
     np.testing.assert_array_equal(polygons.vertices[polygons.corners].reshape(4, 3, 3), CORNERS[FACES])
-    assert polygons.first == (0 if name.endswith("ply") else 1)
+    assert polygons.first == (1 if name.endswith(("stl", "obj")) else 0)
     assert polygons.indexed == (not name.endswith("stl"))
 
 
@@ -140,6 +173,26 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     ),
     "binary.ply": (binary_ply(">")[:-3], "states 4 of 'face', the file ends after 3"),
     "surplus.ply": (binary_ply("<") + b"xx", "2 bytes more"),
+    "none.off": (OFF.encode(), "expected 'OFF' in the first line"),
+    "four.off": (b"4OFF\n", "expected 'OFF' in the first line"),
+    "short.off": (f"OFF\n4 4 6\n{OFF[:-8]}".encode(), "states 4 faces, the file has 3"),
+    "long.off": (f"OFF\n4 3 6\n{OFF}".encode(), "line 10: more lines"),
+    "beyond.off": (f"OFF\n4 4 6\n{OFF}".replace("3 1 2 3", "3 1 2 4").encode(), "line 10: a face names vertex 4"),
+    "count.off": (f"OFF\n4 4 6\n{OFF}".replace("3 1 2 3", "4 1 2 3").encode(), "line 10: a face of 4 vertices"),
+    "comma.off": (f"OFF\n4 4 6\n{OFF}".replace("1 0 0", "1,5 0 0").encode(), "line 4: '1,5' has a decimal comma"),
+    "short.vtk": (LEGACY[:-8].encode(), "truncated: line 11 states 16 numbers, the file ends after 12"),
+    "fewer.vtk": (LEGACY.replace("POLYGONS 4", "POLYGONS 3").encode(), "line 8 states 3 cells .* 4 fit"),
+    "beyond.vtk": (LEGACY.replace("3 1 2 3", "3 1 2 4").encode(), "polygon 3 names vertex 4"),
+    "count.vtk": (LEGACY.replace("3 1 2 3", "4 1 2 3").encode(), "line 8 states 4 cells .* 3 fit"),
+    "comma.vtk": (LEGACY.replace("1 0 0", "1,5 0 0").encode(), "line 6: '1,5' has a decimal comma"),
+    "grid.vtk": (LEGACY.replace("POLYDATA", "UNSTRUCTURED_GRID").encode(), "expected DATASET POLYDATA, .*Extract Surface"),
+    "strips.vtk": (LEGACY.replace("POLYGONS", "TRIANGLE_STRIPS").encode(), "line 8: triangle strips, .*Triangulate"),
+    "short.vtp": (vtp("ascii")[:-300], "truncated or damaged: the XML"),
+    "cut.vtp": (vtp("appended")[:-100], "truncated or damaged: array 'connectivity': it ends after 66 of 100 bytes"),
+    "more.vtp": (vtp("ascii").replace(b'Polys="4"', b'Polys="5"'), "states 5 polygons, its arrays hold 4"),
+    "beyond.vtp": (TWO_PIECES.replace(b">0 1 2<", b">0 1 3<"), "polygon 3 names vertex 7"),
+    "lz4.vtp": (vtp("base64, zlib").replace(b"vtkZLibData", b"vtkLZ4Data"), "compressor = 'vtkLZ4DataCompressor'"),
+    "image.vtp": (b'<VTKFile type="ImageData"/>', 'expected <VTKFile type="PolyData">'),
     "liver.step": (b"ISO-10303-21;", r"expected a file that ends in \.stl, \.obj, \.ply"),
 }  # fmt: skip
 
@@ -158,7 +211,7 @@ def test_a_damaged_file_never_ends_in_another_error(name: str) -> None:
     data, read = DIALECTS[name], READERS[Path(name).suffix]
     noise = random.Random(name)
     changed = [data[:cut] for cut in range(0, len(data), 3)]
-    for _ in range(300):
+    for _ in range(150):
         damaged = bytearray(data)
         for _ in range(noise.choice((1, 4))):
             damaged[noise.randrange(len(data))] = noise.randrange(256)
@@ -176,3 +229,16 @@ def test_every_binary_file_that_is_cut_short_is_refused(name: str) -> None:
     for length in range(len(data)):
         with pytest.raises(ReadError):
             read(data[:length])
+
+
+@pytest.mark.parametrize("path", sorted(WRITTEN_BY_VTK.iterdir()), ids=lambda path: str(path.name))
+def test_a_vtk_file_that_is_cut_short_is_refused_or_has_lost_no_number(path: Path) -> None:
+    data, read = path.read_bytes(), READERS[path.suffix]
+    whole = read(data)
+    for length in range(0, len(data), 5):
+        try:
+            polygons = read(data[:length])
+        except ReadError:
+            continue
+        np.testing.assert_array_equal(polygons.corners, whole.corners)
+        np.testing.assert_array_equal(polygons.vertices, whole.vertices)
