@@ -83,6 +83,33 @@ def inspect() -> None:
     print(json.dumps(model.summary(), indent=2) if options.json else accuracy_text(model, options.verbose))
 
 
+def repair() -> None:
+    """Mend a surface file until it bounds one body, and say what was changed: merged vertices, crumbs, holes, triangles
+    that are double, flat, turned or intersecting. The unit stays the file's."""
+    parser = argparse.ArgumentParser(description=repair.__doc__)
+    parser.add_argument("surface", type=Path, metavar="IN", help="STL, OBJ, PLY, OFF, VTK or VTP")
+    parser.add_argument("--output", "-o", type=Path, metavar="OUT.ply", required=True)
+    options = parser.parse_args()
+    with stage_reporter() as stages:
+        stages("libraries")
+        with interrupts.ends_at_once():
+            from palpate.files import check_output, write_atomically
+            from palpate.geometry.repair import repair_surface
+
+        require_ply(options.output)
+        check_output(options.output, [options.surface])
+        stages("repair")
+        data, changes = repair_surface(options.surface)
+    write_atomically(options.output, data, [options.surface])
+    print(*changes, f"wrote {options.output}", sep="\n")
+
+
+def require_ply(path: Path) -> None:
+    """Raises ValueError unless the name is that of a PLY file."""
+    if path.suffix.lower() != ".ply":
+        raise ValueError(f"{path}: expected a name that ends in .ply")
+
+
 def demo() -> None:
     """Build the liver unless it is built, serve it in a second process, poke it, and draw what was felt."""
     parser = argparse.ArgumentParser(description=demo.__doc__)

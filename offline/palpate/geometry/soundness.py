@@ -17,22 +17,6 @@ from palpate.geometry.measures import enclosed_volume, triangle_normals
 Array = NDArray[np.float64]
 Indices = NDArray[np.signedinteger]
 
-_MESHLAB, _BLENDER = "MeshLab: Filters > ", "Blender: in Edit Mode with all selected, Mesh > "
-_CLEANING = f"{_MESHLAB}Cleaning and Repairing > "
-_MERGE = f"{_CLEANING}Merge Close Vertices; {_BLENDER}Merge > By Distance"
-_CLOSE = (
-    f"{_MESHLAB}Remeshing, Simplification and Reconstruction > Close Holes; {_BLENDER}Clean Up > Fill Holes"
-)
-_FLAT = f"{_CLEANING}Remove T-Vertices; {_BLENDER}Clean Up > Degenerate Dissolve"
-_MANIFOLD = f"{_CLEANING}Repair non Manifold Edges, then Close Holes"
-_ORIENT = f"{_MESHLAB}Normals, Curvatures and Orientation > Re-Orient all faces coherently; {_BLENDER}Normals > Recalculate Outside"
-_TURN = f"{_MESHLAB}Normals, Curvatures and Orientation > Invert Faces Orientation; {_BLENDER}Normals > Flip"
-_ONE_PIECE = f"{_CLEANING}Remove Isolated pieces (wrt Face Num.); {_BLENDER}Separate > By Loose Parts, and export the body alone"
-_UNCROSS = (
-    f"{_MESHLAB}Selection > Select Self Intersecting Faces, delete them, then Close Holes; "
-    "Blender: the modifier Remesh with mode Voxel"
-)
-
 
 class SurfaceError(ValueError):
     """A surface doesn't bound one body. The message has a line for each fault: how often, where first, what to do."""
@@ -45,12 +29,14 @@ class Naming:
     unit, unit_m  the file's unit and its length, m
     vertices      (n_vertices,), number of each vertex in the file; None where the format has none
     triangles     (n_triangles,), number of the face that each triangle is of; None: their indices
+    mend          what to do about the faults
     """
 
     unit: str = "m"
     unit_m: float = 1.0
     vertices: Indices | None = None
     triangles: Indices | None = None
+    mend: str = "To mend: palpate repair"
 
     def place(self, point: Array) -> str:
         """A place in the file's unit, and in m where that is another one; point (3,) in m."""
@@ -79,44 +65,44 @@ def check_surface(surface: TriangleSurface, naming: Naming | None = None) -> Non
 
 
 def _faults(surface: TriangleSurface, naming: Naming) -> Iterator[str]:
-    edges, counts, balance = _edges(surface.triangles)
+    edges, counts, balance = edges_of(surface.triangles)
     n_open = int(np.sum(counts == 1))
     if n_open > len(counts) / 2:
         # Pieces and intersections would only repeat this.
         yield (
             f"is open: {n_open} of its {len(counts)} edges belong to one triangle only, so most triangles don't share "
-            f"vertices. To mend: {_MERGE}"
+            f"vertices. {naming.mend}"
         )
         return
-    flat = _flat_triangles(surface)
+    flat = flat_triangles(surface)
     if flat.any():
         first = int(np.argmax(flat))
         where = naming.place(surface.vertices[surface.triangles[first]].mean(axis=0))
         yield (
             f"is degenerate: {flat.sum()} triangles without area, the first is {naming.triangle(first)} near {where}. "
-            f"To mend: {_FLAT}"
+            f"{naming.mend}"
         )
     uneven = (counts == 2) & (balance != 0)
-    for what, fault, description, advice in (
-        ("open", counts == 1, "edges with one triangle", _CLOSE),
-        ("not manifold", counts > 2, "edges with more than two triangles", _MANIFOLD),
-        ("not oriented consistently", uneven, "edges that both triangles run alike", _ORIENT),
+    for what, fault, description in (
+        ("open", counts == 1, "edges with one triangle"),
+        ("not manifold", counts > 2, "edges with more than two triangles"),
+        ("not oriented consistently", uneven, "edges that both triangles run alike"),
     ):
         if fault.any():
             a, b = edges[np.argmax(fault)]
             where = naming.place(surface.vertices[[a, b]].mean(axis=0))
-            yield f"is {what}: {fault.sum()} {description}, the first{naming.edge(a, b)} near {where}. To mend: {advice}"
+            yield f"is {what}: {fault.sum()} {description}, the first{naming.edge(a, b)} near {where}. {naming.mend}"
     yield from _separate_pieces(surface, naming)
     volume = enclosed_volume(surface)
     if np.all(counts == 2) and not uneven.any() and volume <= 0:
         yield (
             f"is inside-out: it encloses {volume:.3g} m³, expected its triangles counter-clockwise seen from outside. "
-            f"To mend: {_TURN}"
+            f"{naming.mend}"
         )
     yield from _crossings(surface, np.flatnonzero(~flat), naming)
 
 
-def _flat_triangles(surface: TriangleSurface) -> NDArray[np.bool_]:
+def flat_triangles(surface: TriangleSurface) -> NDArray[np.bool_]:
     """(n_triangles,): so flat, relative to the longest edge, that the normal is round-off."""
     corners = surface.vertices[surface.triangles]
     edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
@@ -124,7 +110,7 @@ def _flat_triangles(surface: TriangleSurface) -> NDArray[np.bool_]:
     return areas <= 1e-10 * edges**2
 
 
-def _edges(triangles: Indices) -> tuple[Indices, Indices, Indices]:
+def edges_of(triangles: Indices) -> tuple[Indices, Indices, Indices]:
     """Edges (n, 2), how many triangles have each (n,), and how many more run it upward than downward (n,)."""
     directed = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     edges, which, counts = np.unique(
@@ -145,7 +131,7 @@ def _separate_pieces(surface: TriangleSurface, naming: Naming) -> Iterator[str]:
         where = naming.place(surface.vertices[triangles[smallest]].mean(axis=0))
         yield (
             f"has {len(pieces)} separate pieces, expected 1 (no cavities, no second body): the smallest has {sizes.min()} "
-            f"triangles near {where}. To mend: {_ONE_PIECE}"
+            f"triangles near {where}. {naming.mend}"
         )
 
 
@@ -160,7 +146,7 @@ def _crossings(surface: TriangleSurface, solid: Indices, naming: Naming) -> Iter
         where = naming.place(surface.vertices[triangles[first]].mean(axis=0))
         yield (
             f"intersects itself: {len(pairs)} pairs of triangles, the first are {naming.triangle(solid[first])} and "
-            f"{naming.triangle(solid[second])} near {where}. To mend: {_UNCROSS}"
+            f"{naming.triangle(solid[second])} near {where}. {naming.mend}"
         )
 
 

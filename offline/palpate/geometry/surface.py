@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,12 +34,24 @@ def load_surface(path: Path, unit: LengthUnit = "m") -> LoadedSurface:
     and unused ones dropped. Raises FileNotFoundError, and SurfaceError when the file can't be read, or with all that
     `check_surface` finds.
     """
+    mended = f"{path.with_suffix('')}-mended.ply"
+    mend = f"To mend: palpate repair {shlex.quote(str(path))} -o {shlex.quote(mended)}"
     try:
-        polygons = read_polygons(path)
-        extent = _extent(polygons, unit)
-        triangles, owner = triangulate(polygons)
-    except ReadError as error:
-        raise SurfaceError(f"{path}: {error}") from error
+        loaded = from_polygons(read_polygons(path), unit, mend)
+    except (ReadError, SurfaceError) as error:
+        raise SurfaceError("\n".join(f"{path}: {line}" for line in str(error).splitlines())) from error
+    return LoadedSurface(loaded.surface, tuple(f"{path}: {note}" for note in loaded.notes))
+
+
+def from_polygons(polygons: Polygons, unit: LengthUnit, mend: str) -> LoadedSurface:
+    """The closed surface of polygons whose coordinates are in the unit.
+
+    mend  what to do about faults that `check_surface` finds: the end of their messages
+
+    Raises ReadError, SurfaceError.
+    """
+    extent = _extent(polygons, unit)
+    triangles, owner = triangulate(polygons)
     tolerance = MERGE_TOLERANCE * float(np.linalg.norm(extent))
     welded = weld(polygons.vertices, triangles, owner, tolerance)
     surface = TriangleSurface(welded.vertices * UNITS_M[unit], welded.triangles.astype(np.int32))
@@ -47,19 +60,17 @@ def load_surface(path: Path, unit: LengthUnit = "m") -> LoadedSurface:
         unit_m=UNITS_M[unit],
         vertices=welded.original + polygons.first if polygons.indexed else None,
         triangles=welded.owner + polygons.first,
+        mend=mend,
     )
-    try:
-        check_surface(surface, naming)
-    except SurfaceError as error:
-        raise SurfaceError("\n".join(f"{path}: {line}" for line in str(error).splitlines())) from error
+    check_surface(surface, naming)
     notes = []
     if welded.n_merged:
         notes.append(
-            f"{path}: merged {welded.n_merged:,} vertices with others within {tolerance:.2g} {unit}, {MERGE_TOLERANCE:g} of "
+            f"merged {welded.n_merged:,} vertices with others within {tolerance:.2g} {unit}, {MERGE_TOLERANCE:g} of "
             "the body's diagonal"
         )
     if welded.n_dropped:
-        notes.append(f"{path}: left out {welded.n_dropped:,} triangles that had two corners at one place")
+        notes.append(f"left out {welded.n_dropped:,} triangles that had two corners at one place")
     return LoadedSurface(surface, tuple(notes))
 
 
