@@ -96,4 +96,4 @@ def ritz_memory(n_nodes: int, n_contacts: int, support_radius_factor: float) -> 
     stiffness = 12 * 9 * 228 * n_nodes * wider**4
     factor = 8 * 37 * n_nodes**1.6 * wider**2.5 * (1 if solver_name() == "MKL PARDISO" else 4)
     vectors = 2 * 8 * 3 * n_nodes * (STEPS_EXPECTED + STEPS_ABOVE_THE_BAND) * 3 * n_contacts
-    return 0.35 * 2**30 + max(5 * stiffness, 3 * stiffness + factor + vectors)
+    return 0.5 * 2**30 + max(5 * stiffness, 3 * stiffness + factor + vectors)

@@ -58,6 +58,12 @@ class HeldBody:
         """P (K + sigma M + Cᵀ W C)⁻¹ P load: symmetric, the constraints exact, the rest up to the compliance of the penalty."""
         return self.project(self.factor.solve(self.project(load)))
 
+    def respond(self, load: Array) -> Array:
+        """The approximate response, corrected once: right to some nine digits."""
+        load = self.project(load)
+        response = self.approximate(load)
+        return response + self.approximate(load - self._reaction(response))
+
     def solve(self, load: Array) -> Array:
         """(c n_nodes, k): the parameters under loads (c n_nodes, k), N, which are conjugate to parameters.
 

@@ -36,15 +36,16 @@ class KrylovSpace:
         """(c n_nodes, size), V."""
         return self._vectors[:, : self.size]
 
-    def extend(self, held: HeldBody) -> bool:
-        """Append the static response of the held body to the inertia of the last block, (K + sigma M)⁻¹ M V.
-
-        False where that holds nothing new, or does not fit any more.
-        """
-        return self.append(held, held.approximate(held.body.inertia(self._vectors[:, self._last_block])))
+    @property
+    def last_block(self) -> Array:
+        """(c n_nodes, k), the vectors that were appended last."""
+        return self._vectors[:, self._last_block]
 
     def append(self, held: HeldBody, fields: Array) -> bool:
-        """Append a block that spans parameters (c n_nodes, k) beside the vectors before. False as in `extend`."""
+        """Append a block that spans parameters (c n_nodes, k) beside the vectors before.
+
+        False where they hold nothing new, or do not fit any more.
+        """
         root_mass = np.repeat(np.sqrt(held.body.mass), held.body.n_components)[:, None]
         before, weighted_before = self.vectors, self._weighted[:, : self.size]
         weighted = root_mass * held.body.basis.values(fields)

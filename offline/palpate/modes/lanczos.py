@@ -56,7 +56,7 @@ def lowest_modes(held: HeldBody, n_modes: int, seed: int = 0) -> LowestModes:
     space.append(held, held.project(random.standard_normal((n, min(BLOCK, most)))))
     while True:
         known = space.size
-        growing = space.extend(held)
+        growing = space.append(held, held.approximate(held.body.inertia(space.last_block)))
         inverse = _bordered(inverse, space.coefficients, known)
         if growing and known < max(2 * wanted, 1.2 * judged):
             continue

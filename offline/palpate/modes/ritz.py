@@ -16,7 +16,7 @@ from scipy.linalg import eigh
 
 from palpate.discretization.assembled_body import AssembledBody
 from palpate.modes.elastic_modes import ElasticModes
-from palpate.modes.held_body import hold
+from palpate.modes.held_body import HeldBody, hold
 from palpate.modes.krylov import KrylovSpace
 
 Array = NDArray[np.float64]
@@ -77,16 +77,16 @@ def ritz_modes(
     change, force = np.inf, projected.force(squared_s)
     while growing and change > tolerance and space.size < MOST_STEPS * n_inputs:
         for _ in range(STEPS_JUDGED):
-            growing = growing and space.extend(held)
+            growing = growing and _extend(space, held)
         projected = projected.extended(space.vectors)
         before, force = force, projected.force(squared_s)
         change = _largest_relative(force - before, force)
     for sigma, steps in shifts:
         del held  # one factor at a time is all that a large body's memory holds
         held = hold(body, supports.prescribed, sigma)
-        growing = space.append(held, held.approximate(patch_force))
-        for _ in range(steps - 1):
-            growing = growing and space.extend(held)
+        growing = True  # the last block holds more that is new than the response to the patch does
+        for _ in range(steps):
+            growing = growing and _extend(space, held)
     return RitzModes(projected.extended(space.vectors).modes(space.vectors, patch), change, solver)
 
 
@@ -126,6 +126,15 @@ class _Projected:
             parameters=vectors @ rotation,
             patch_parameters=patch,
         )
+
+
+def _extend(space: KrylovSpace, held: HeldBody) -> bool:
+    """Append (K + sigma M)⁻¹ M times the last block.
+
+    Without the correction in `respond` the responses at 0 Hz and at a shift would belong to bodies with supports of
+    different compliance, and their difference, not the shift, would be what is new in the second ones.
+    """
+    return space.append(held, held.respond(held.body.inertia(space.last_block)))
 
 
 def _largest_relative(difference: NDArray[np.complex128], force: NDArray[np.complex128]) -> float:
