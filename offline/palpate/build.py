@@ -16,8 +16,9 @@ from palpate.factorization import solver_name
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.regions import ContactPatch
 from palpate.lti.block_form import to_block_form
+from palpate.lti.errors import ReductionError
 from palpate.lti.pole_residue import PoleResidueSystem
-from palpate.lti.sampling import sample, sampled_response
+from palpate.lti.sampling import Sampling
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.model_file import Contact, ReducedModel, StateSpace, Surface
 from palpate.modes.body_modes import body_modes, by_ritz, require_memory
@@ -25,6 +26,7 @@ from palpate.modes.elastic_modes import ElasticModes
 from palpate.progress import NO_PROGRESS, Progress
 from palpate.reduction.accuracy import measure, refuse_meaningless
 from palpate.reduction.methods import Reduction, reduce
+from palpate.reduction.passive import passive
 from palpate.reduction.surface import fit_surface_output
 from palpate.scene.material import Material
 from palpate.scene.plausibility import plausibility
@@ -62,9 +64,8 @@ def build_model(config: Config, folder: Path, progress: Progress = NO_PROGRESS) 
     """
     digest = fingerprint(config, folder)
     full = build_full_model(config, folder, progress)
-    reduction, running = _reduce(full.system, config.reduction, progress)
+    reduction, running, surface, surface_error = _reduce_with_surface(full, config, progress)
     discrete = to_block_form(running)
-    surface, surface_error = _surface(full, discrete, config, progress)
     progress("accuracy")
     accuracy = measure(
         full.system,
@@ -141,22 +142,52 @@ def _modes_stage(body: AssembledBody) -> str:
     return f"modes, Ritz, {name}{better}"
 
 
+def _reduce_with_surface(
+    full: FullModel, config: Config, progress: Progress
+) -> tuple[Reduction, PoleResidueSystem, Surface, float]:
+    """The reduced system, the same sampled, its surface and the surface's error.
+
+    Where a tolerance chooses the order, it is tightened until the surface keeps to its own, or the method has no more.
+    """
+    wanted = config.reduction
+    reduction, running = _reduce(full, wanted, wanted.tolerance, progress)
+    surface, error = _surface(full, to_block_form(running), config, progress)
+    tolerance = wanted.tolerance
+    while tolerance is not None and error > wanted.tolerance_surface:
+        tolerance /= 3
+        try:
+            reduction, running = _reduce(full, wanted, tolerance, progress)
+        except ReductionError:
+            progress.warn(
+                f"the surface is wrong by {100 * error:.2g} %, reduction.tolerance_surface is "
+                f"{100 * wanted.tolerance_surface:.2g} %: {wanted.method} comes no nearer"
+            )
+            break
+        surface, error = _surface(full, to_block_form(running), config, progress)
+    return reduction, running, surface, error
+
+
 def _reduce(
-    system: PoleResidueSystem, wanted: ReductionTable, progress: Progress
+    full: FullModel, wanted: ReductionTable, tolerance: float | None, progress: Progress
 ) -> tuple[Reduction, PoleResidueSystem]:
     """The reduced system, and the same sampled."""
     progress(f"reduction, {wanted.method}")
-    period_s, rule, band_end_hz = wanted.period_s, wanted.sampling, wanted.band_hz[1]
-    reduction = reduce(
-        system,
-        wanted.method,
-        order=wanted.order,
-        tolerance=wanted.tolerance,
-        band_hz=wanted.band_hz,
-        response=lambda reduced, omega: sampled_response(reduced, omega, period_s, rule, band_end_hz),
-    )
-    progress.note(f"{system.n_states:,} → {reduction.order} states")
-    return reduction, sample(reduction.system, period_s, rule, band_end_hz)
+    sampling = Sampling(wanted.period_s, wanted.sampling, wanted.band_hz)
+    if wanted.method == "passive":
+        reduction = passive(
+            full.system, full.modes, full.material.prony, sampling, order=wanted.order, tolerance=tolerance
+        )
+    else:
+        reduction = reduce(
+            full.system,
+            wanted.method,
+            order=wanted.order,
+            tolerance=tolerance,
+            band_hz=wanted.band_hz,
+            response=sampling.response,
+        )
+    progress.note(f"{full.system.n_states:,} → {reduction.order} states")
+    return reduction, sampling.sample(reduction.system)
 
 
 def _surface(

@@ -21,7 +21,7 @@ def build() -> None:
     )
     parser.add_argument(
         "--method",
-        help="of the reduction: tbr, tbr-band, hankel-optimal, modal or modal-static (default: the scene's)",
+        help="of the reduction: passive, tbr, tbr-band, hankel-optimal, modal or modal-static (default: the scene's)",
     )
     stop = parser.add_mutually_exclusive_group()
     stop.add_argument("--order", type=int, help="number of states of the reduced model")

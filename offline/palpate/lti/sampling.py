@@ -23,6 +23,7 @@ Tustin 1947; Franklin, Powell & Workman 1998, sections 6.1 and 6.3.2; Liniger & 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -108,15 +109,24 @@ def damping(z: Complex, own_decay: Array) -> Array:
     return np.where(too_slow, numerator / np.where(too_slow, denominator, 1.0), 1.0)
 
 
-def sampled_response(
-    system: PoleResidueSystem,
-    omega: Array,
-    period_s: float,
-    rule: SamplingRule,
-    band_hz: float = 0.0,
-) -> Complex:
-    """(n, n_outputs, n_inputs): response of the system, once sampled, to sines of omega (n,), rad/s, below pi/period_s."""
-    return sample(system, period_s, rule, band_hz).transfer(np.exp(1j * omega * period_s))
+@dataclass(frozen=True)
+class Sampling:
+    """How a model will be sampled.
+
+    band_hz  (low, high) of the haptic band: the trapezoidal rule is true to frequency there
+    """
+
+    period_s: float
+    rule: SamplingRule = "bilinear"
+    band_hz: tuple[float, float] = (0.0, 30.0)
+
+    def sample(self, system: PoleResidueSystem) -> PoleResidueSystem:
+        """The system sampled, see `sample`."""
+        return sample(system, self.period_s, self.rule, self.band_hz[1])
+
+    def response(self, system: PoleResidueSystem, omega: Array) -> Complex:
+        """(n, n_outputs, n_inputs): of the system, once sampled, to sines of omega (n,), rad/s, below pi/period_s."""
+        return self.sample(system).transfer(np.exp(1j * omega * self.period_s))
 
 
 def _prewarped(system: PoleResidueSystem, period_s: float, limit: float) -> PoleResidueSystem:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.lti.pole_residue import PoleResidueSystem
 
 FORMAT = "palpate.reduced-model"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-4, 1e-1
 
@@ -119,6 +119,9 @@ class AccuracyReport:
                            response counts the poles beyond half the sampling rate, which no sample follows, at rest
     error_time_domain      on a poke: largest force error over the largest force, discrete model against exact response
     error_surface_in_band  surface displacement in the band: largest over the frequencies of |error| over |displacement|
+    gain_above_band        largest |F| / |F_full| from the band's end to half the sampling rate, F being the discrete model
+    change_over_last_vectors  largest relative change of the full model's force in the band by the last of the vectors that it
+                           was projected on; 0 where it has all modes
     spectral_abscissa      largest real part of the reduced poles, 1/s
     spectral_abscissa_full the same of the full model, 1/s
     passivity_margin       smallest eigenvalue, over all frequencies, of the part of the discrete force response that
@@ -139,6 +142,8 @@ class AccuracyReport:
     error_step: float
     error_time_domain: float
     error_surface_in_band: float
+    gain_above_band: float
+    change_over_last_vectors: float
     spectral_abscissa: float
     spectral_abscissa_full: float
     passivity_margin: float

@@ -3,6 +3,7 @@
 from palpate.lti.errors import ReductionError
 from palpate.reduction.accuracy import measure
 from palpate.reduction.methods import METHODS, Method, Reduction, reduce, reductions
+from palpate.reduction.passive import passive
 from palpate.reduction.surface import SurfaceOutput, fit_surface_output
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "SurfaceOutput",
     "fit_surface_output",
     "measure",
+    "passive",
     "reduce",
     "reductions",
 ]

@@ -40,11 +40,12 @@ def measure(
     band_hz: tuple[float, float],
     error_surface_in_band: float,
     resolved_frequency_hz: float,
+    change_over_last_vectors: float = 0.0,
 ) -> AccuracyReport:
     """The accuracy report that goes with a model; `palpate.model_file.AccuracyReport` defines each figure.
 
     running  the reduced system sampled at period_s
-    The surface error and the resolved frequency are passed on.
+    The surface error, the resolved frequency and the change over the last vectors are passed on.
     """
     errors, largest = _hinf(full, reduction.system)
     in_band = band_frequencies((full, reduction.system), band_hz)
@@ -63,6 +64,8 @@ def measure(
         error_step=step_error(full, running, period_s),
         error_time_domain=time_domain_error(full, running, poke(full.n_inputs, period_s, band_hz), period_s),
         error_surface_in_band=error_surface_in_band,
+        gain_above_band=gain_above_band(full, running, period_s, band_hz[1]),
+        change_over_last_vectors=change_over_last_vectors,
         spectral_abscissa=reduction.system.spectral_abscissa,
         spectral_abscissa_full=full.spectral_abscissa,
         passivity_margin=passivity_margin(running),
@@ -81,6 +84,26 @@ def in_band_error(full: PoleResidueSystem, reduced: PoleResidueSystem, omega: Ar
         return relative_errors(full.transfer(1j * w), reduced.transfer(1j * w))
 
     return maximum(error, omega)[1]
+
+
+def gain_above_band(
+    full: PoleResidueSystem, running: PoleResidueSystem, period_s: float, band_end_hz: float
+) -> float:
+    """Largest |F_running| / |F| from the band's end to half the sampling rate.
+
+    The trapezoidal rule alone makes it more than 1 where the force rises with frequency: it shifts frequencies down.
+    """
+    start, end = 2 * np.pi * band_end_hz, np.pi / period_s
+    resonances = np.angle(running.poles[running.is_pair]) / period_s
+    omega = np.concatenate([np.linspace(start, end, 800), np.geomspace(start, end, 400), resonances])
+    omega = np.unique(omega[(omega >= start) & (omega <= end)])
+
+    def gain(w: Array) -> Array:
+        return spectral_norms(running.transfer(np.exp(1j * w * period_s))) / spectral_norms(
+            full.transfer(1j * w)
+        )
+
+    return maximum(gain, omega)[1]
 
 
 def hinf_error(full: PoleResidueSystem, reduced: PoleResidueSystem) -> float:

@@ -133,7 +133,7 @@ def reductions(
         raise ValueError(f"method = {method!r}: expected one of {', '.join(METHODS)}")
     if not 0 <= band_hz[0] < band_hz[1] < math.inf:
         raise ValueError(f"band_hz = {band_hz}: expected (low, high) with 0 <= low < high")
-    _check_stability(system)
+    check_stability(system)
     if method in ("modal", "modal-static"):
         return _modal(system, keep_statics=method == "modal-static")
     balancing = balance(real_form(system), _gramians(system, method, band_hz))
@@ -170,7 +170,7 @@ def _check_arguments(order: int | None, tolerance: float | None) -> None:
         raise ValueError(f"tolerance = {tolerance}: expected a number above 0")
 
 
-def _check_stability(system: PoleResidueSystem) -> None:
+def check_stability(system: PoleResidueSystem) -> None:
     abscissa = system.spectral_abscissa
     if len(system.poles) and np.all(system.poles.real == 0):
         raise ReductionError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,8 +60,9 @@ def fit_surface_output(
             f"surface_shapes {surface_shapes.shape} and surface_patch_shapes {surface_patch_shapes.shape}: expected "
             f"{expected[0]} and {expected[1]}"
         )
-    # Each gives 2 n_inputs equations for a row's `order` unknowns, so as many as states leave none to chance.
-    omega = _frequencies(modes, prony, band_hz, max(_LEAST_FIT_FREQUENCIES, discrete.order))
+    # Each gives 2 n_inputs equations for a row's `order` unknowns: three times as many leave none to chance.
+    enough = math.ceil(3 * discrete.order / (2 * discrete.b.shape[1]))
+    omega = _frequencies(modes, prony, band_hz, max(_LEAST_FIT_FREQUENCIES, enough))
     fitted, held_out = omega[0::2], omega[1::2]
     full = _surface_response(modes, prony, surface_shapes, surface_patch_shapes, fitted)
     states = _state_response(discrete, fitted, period_s)

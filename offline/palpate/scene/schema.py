@@ -16,7 +16,7 @@ from palpate.scene.material import PRESETS, Material, PronySeries, check_constan
 from palpate.scene.quantities import MAX_NODES, SHORTEST_M, Count, Length, LengthUnit, Number, Point, Table
 from palpate.scene.regions import Region
 
-ReductionMethod = Literal["tbr", "tbr-band", "hankel-optimal", "modal", "modal-static"]
+ReductionMethod = Literal["passive", "tbr", "tbr-band", "hankel-optimal", "modal", "modal-static"]
 
 _SHORTEST_TAU_IN_PERIODS = 0.01
 """A faster branch acts as a damper, and its terms are lost in round-off."""
@@ -148,10 +148,16 @@ class DiscretizationTable(Table):
 class ReductionTable(Table):
     """How the full model is reduced and sampled."""
 
-    method: ReductionMethod = "tbr-band"
+    method: ReductionMethod = "passive"
     order: Count | None = Field(default=None, ge=2, description="number of states")
     tolerance: Number | None = Field(
         default=None, ge=1e-12, lt=1, description="largest relative in-band force error"
+    )
+    tolerance_surface: Number = Field(
+        default=0.03,
+        ge=1e-6,
+        lt=1,
+        description="largest relative in-band error of the surface; with tolerance",
     )
     band_hz: tuple[Number, Number] = (0.0, 30.0)
     period_s: Number = Field(default=1e-3, ge=SHORTEST_PERIOD_S, le=LONGEST_PERIOD_S)
@@ -181,7 +187,7 @@ class Config(Table):
     fixed: tuple[Annotated[Region, Field(discriminator="region")], ...] = Field(min_length=1)
     contact: tuple[ContactTable, ...] = Field(min_length=1)
     discretization: DiscretizationTable = DiscretizationTable()
-    reduction: ReductionTable = ReductionTable(tolerance=0.02)
+    reduction: ReductionTable = ReductionTable(tolerance=0.01)
 
     @model_validator(mode="after")
     def _contacts_can_be_told_apart(self) -> Config:
@@ -194,6 +200,15 @@ class Config(Table):
                     raise ValueError(
                         f"contact {contact.name!r} has spacing_m, but a {self.geometry.shape} is a uniform cloud: "
                         "only a surface can be refined around a contact"
+                    )
+        if self.reduction.method == "passive":
+            for key, value, needed in (
+                ("discretization.method", self.discretization.method, "conservative"),
+                ("reduction.sampling", self.reduction.sampling, "bilinear"),
+            ):
+                if value != needed:
+                    raise ValueError(
+                        f"{key} = {value!r}: reduction.method 'passive' needs {needed!r}; or choose another, such as 'tbr-band'"
                     )
         shortest = _SHORTEST_TAU_IN_PERIODS * self.reduction.period_s
         too_short = [tau for tau in self.material.material().prony.tau_s if tau < shortest]

@@ -11,7 +11,7 @@ import scipy.signal
 from palpate.build import build_full_model
 from palpate.lti.block_form import to_block_form
 from palpate.lti.pole_residue import PoleResidueSystem
-from palpate.lti.sampling import SamplingRule, damping, sample, sampled_response
+from palpate.lti.sampling import Sampling, SamplingRule, damping, sample
 from palpate.lti.stepping import step_through
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.modes.elastic_modes import ElasticModes
@@ -70,7 +70,9 @@ def test_the_damped_trapezoidal_rule_is_the_continuous_response_at_warped_freque
         )
         assert np.all(s.real > -1e-9 * np.abs(s))  # the unit circle comes to lie in the right half plane
         expected += alone.transfer(s)
-    np.testing.assert_allclose(sampled_response(system, omega, PERIOD_S, "bilinear"), expected, rtol=1e-8)
+    np.testing.assert_allclose(
+        Sampling(PERIOD_S, band_hz=(0.0, 0.0)).response(system, omega), expected, rtol=1e-8
+    )
 
 
 def test_each_pole_decays_as_in_continuous_time_and_beyond_half_the_sampling_rate_quickly() -> None:
@@ -149,7 +151,7 @@ def test_the_hold_answers_the_images_of_a_sampled_sine_as_well() -> None:
     # What all images would weigh with D alone; the rest of F dies out well below the last image.
     dynamic = system.transfer(1j * images.ravel()).reshape(*images.shape, 3, 3) - system.d
     expected = system.d + np.einsum("wk,wkpm->wpm", weights, dynamic)
-    found = sampled_response(system, omega, PERIOD_S, "first-order-hold")
+    found = Sampling(PERIOD_S, "first-order-hold").response(system, omega)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
 
 
@@ -168,7 +170,7 @@ def test_prewarping_takes_the_error_of_sharp_resonances_away_and_leaves_the_body
     exact = system.transfer(1j * omega)
 
     def error(band_hz: float) -> float:
-        sampled = sampled_response(system, omega, PERIOD_S, "bilinear", band_hz)
+        sampled = Sampling(PERIOD_S, band_hz=(0.0, band_hz)).response(system, omega)
         return float(np.max(np.linalg.norm(sampled - exact, 2, (1, 2)) / np.linalg.norm(exact, 2, (1, 2))))
 
     assert error(30.0) < 0.25 * error(0.0)

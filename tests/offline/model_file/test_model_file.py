@@ -104,9 +104,9 @@ def test_foreign_files_are_refused(tmp_path: Path) -> None:
 
 def test_a_file_of_schema_1_is_refused_with_what_to_do(tmp_path: Path) -> None:
     # Schema 1 had no checksum, and the same first fields.
-    metadata = json.dumps({"format": "palpate.reduced-model", "schema_version": 1}).encode()
+    metadata = json.dumps({"format": "palpate.reduced-model", "schema_version": 2}).encode()
     np.savez_compressed(tmp_path / "old.npz", metadata=np.frombuffer(metadata, np.uint8))
-    with pytest.raises(ModelFileError, match=r"schema_version' is 1: expected 2; .* build it again with"):
+    with pytest.raises(ModelFileError, match=r"schema_version' is 2: expected 3; .* build it again with"):
         load_model(tmp_path / "old.npz")
 
 
@@ -136,7 +136,7 @@ def without_states(metadata: dict[str, Any], arrays: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (meta("schema_version", 3), "'schema_version' is 3: .*newer palpate"),
+        (meta("schema_version", 4), "'schema_version' is 4: .*newer palpate"),
         (meta("schema_version", True), "'schema_version' is True"),
         (meta("format", "other"), "'format' is 'other'"),
         (meta("kind", "surface"), "'kind' is 'surface': expected 'patch'"),
