@@ -75,6 +75,7 @@ def build_model(config: Config, folder: Path, progress: Progress = NO_PROGRESS) 
         band_hz=config.reduction.band_hz,
         error_surface_in_band=surface_error,
         resolved_frequency_hz=resolved_frequency_hz(full.cloud, full.material),
+        change_over_last_vectors=full.change_over_last_vectors,
     )
     progress.note(f"force error in band {100 * accuracy.error_in_band:.2g} %")
     refuse_meaningless(accuracy, config.reduction.method)

@@ -61,8 +61,8 @@ def viscoelastic_system(modes: ElasticModes, prony: PronySeries) -> PoleResidueS
         )
     roots_of_residues = np.sqrt(residues)
     n_modes, per_mode = poles.shape
-    poles_b = (roots_of_residues[:, :, None] * b[:, None, :]).reshape(n_modes * per_mode, -1)
-    poles_c = (roots_of_residues[:, :, None] * c.T[:, None, :]).reshape(n_modes * per_mode, -1)
+    poles_b = (roots_of_residues[:, :, None] * b[:, None, :]).reshape(n_modes * per_mode, b.shape[1])
+    poles_c = (roots_of_residues[:, :, None] * c.T[:, None, :]).reshape(n_modes * per_mode, b.shape[1])
     poles = poles.reshape(-1)
     group = np.repeat(np.arange(1, n_modes + 1), per_mode)
 

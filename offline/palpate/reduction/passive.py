@@ -185,7 +185,7 @@ def _of_order(
                 return system
             n_terms = system.n_states - kept.n_states
     raise ReductionError(
-        f"order = {order}: passive needs {system.n_states if n_terms else kept.n_states} states here for the static "
+        f"order = {order}: passive needs at least {system.n_states if n_terms else kept.n_states} states here for the static "
         "stiffness and what lies above the band"
     )
 

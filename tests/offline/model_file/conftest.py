@@ -66,6 +66,8 @@ def _small_model() -> ReducedModel:
             error_step=0.004,
             error_time_domain=0.003,
             error_surface_in_band=0.05,
+            gain_above_band=1.4,
+            change_over_last_vectors=2e-4,
             spectral_abscissa=-1.0,
             spectral_abscissa_full=-0.9,
             passivity_margin=-1e-5,

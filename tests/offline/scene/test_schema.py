@@ -59,8 +59,9 @@ def changed(path: str, value: Any) -> dict[str, Any]:
 
 def test_a_valid_scene_is_taken_with_its_defaults() -> None:
     config = check_config(SCENE, "slab.toml")
-    assert config.reduction.method == "tbr-band"
-    assert config.reduction.tolerance == 0.02
+    assert config.reduction.method == "passive"
+    assert config.reduction.tolerance == 0.01
+    assert config.reduction.tolerance_surface == 0.03
     assert config.discretization.method == "conservative"
     material = config.material.material()
     assert material.shear_modulus_pa == pytest.approx(5000 / 2.9)
