@@ -22,6 +22,7 @@ term sampled, and the sampling rule keeps a passive term passive.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
@@ -176,18 +177,24 @@ def _of_order(
 ) -> PoleResidueSystem:
     """The model of about the most blocks that has at most `order` states."""
     below = 2 * np.pi * sampling.band_hz[1] * _KEPT_UP_TO[0]
+
+    def kept(n_blocks: int) -> PoleResidueSystem:
+        return viscoelastic_system(subspace.ritz_modes(n_blocks, below), prony)
+
     n_terms = 0  # states of the fitted terms: known after a fit, and much the same for other blocks
-    for n_blocks in range(subspace.n_blocks, -1, -1):
-        kept = viscoelastic_system(subspace.ritz_modes(n_blocks, below), prony)
-        if kept.n_states + n_terms <= order:
-            system = with_fitted_terms(full, kept, below, sampling)
-            if system.n_states <= order:
-                return system
-            n_terms = system.n_states - kept.n_states
-    raise ReductionError(
-        f"order = {order}: passive needs at least {system.n_states if n_terms else kept.n_states} states here for the static "
-        "stiffness and what lies above the band"
-    )
+    while True:
+        possible = range(subspace.n_blocks + 1)
+        n_blocks = bisect_right(possible, order - n_terms, key=lambda n: kept(n).n_states) - 1
+        if n_blocks < 0:
+            raise ReductionError(
+                f"order = {order}: passive needs at least {kept(0).n_states + n_terms} states here for the static "
+                "stiffness and what lies above the band"
+            )
+        chosen = kept(n_blocks)
+        system = with_fitted_terms(full, chosen, below, sampling)
+        if system.n_states <= order:
+            return system
+        n_terms = max(system.n_states - chosen.n_states, n_terms + 1)
 
 
 def _within(
