@@ -30,7 +30,8 @@ def conservative(
     basis, h = nodal_basis(membrane.points, membrane.spacing, SUPPORT_RADIUS_FACTOR, derivatives=1)
     edge, rim = membrane.edge.copy(), membrane.on_edge
     edge[rim] = obeying_divergence_theorem(edge[rim], membrane.points[rim], float(membrane.areas.sum()))
-    gradient = consistent_gradient(membrane.points, membrane.areas, membrane.spacing, edge, h, basis.radii)
+    points, target = membrane.points, h.value.T @ edge
+    gradient = consistent_gradient(points, points, membrane.areas, membrane.spacing, target, h, basis.radii)
     tension = diags_array(tension_n_per_m * membrane.areas)
     return AssembledBody(
         basis=basis,

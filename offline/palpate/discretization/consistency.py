@@ -29,18 +29,25 @@ SAMPLES_A_SPACING = 6
 
 
 def consistent_gradient(
-    points: Array, volumes: Array, spacing: Array, boundary: Array, h: ShapeFunctions, radii: Array
+    nodes: Array,
+    places: Array,
+    volumes: Array,
+    spacing: Array,
+    target: Array,
+    h: ShapeFunctions,
+    radii: Array,
 ) -> list[csr_array]:
     """The derivatives along each axis, (n_nodes, n_nodes) acting on parameters, 1/m, with the sparsity of h.
 
-    points (n_nodes, dim), volumes, spacing and support radii (n_nodes,); h the shape functions at the nodes themselves.
-    boundary (n_nodes, dim) holds the vector areas b, which satisfy sum b = 0 and sum x b^T = sum V 1. Then the
-    derivatives are exact for linear fields at every node, and sum_I V_I G_IJ = (H^T b)_J.
+    nodes (n_nodes, dim), places (n_nodes, dim) where the strain of each is taken, volumes, spacing and support radii
+    (n_nodes,); h the shape functions at the places. target (n_nodes, dim), m², is H^T b with the shape functions H at the
+    nodes and the vector areas b, which satisfy sum b = 0 and sum x b^T = sum V 1. Then the derivatives are exact for
+    linear fields at every node, and sum_I V_I G_IJ = target_J.
     """
-    n, terms = len(points), 1 + points.shape[1]
+    n, terms = len(nodes), 1 + nodes.shape[1]
     node = np.repeat(np.arange(n), np.diff(h.value.indptr))
     other = h.value.indices
-    offset = points[other] - points[node]
+    offset = nodes[other] - places[node]
     weight = quartic_spline(np.minimum(np.linalg.norm(offset, axis=1) / radii[other], 1.0))
     linear = np.column_stack([np.ones(len(offset)), offset / spacing[node, None]])  # (nnz, terms)
     # With multipliers xi the correction is W (xi - its local linear fit) V / h², whose constraint is S xi = defect.
@@ -64,13 +71,12 @@ def consistent_gradient(
     # Linear fields need no correction: they are the null space. A defect without a part along them has multipliers that
     # are zero at nodes which fix a linear field, and a 1 on the diagonal there finds these.
     null, _ = np.linalg.qr(
-        np.sqrt(diagonal)[:, None] * np.column_stack([np.ones(n), points - points.mean(axis=0)])
+        np.sqrt(diagonal)[:, None] * np.column_stack([np.ones(n), nodes - nodes.mean(axis=0)])
     )
     pinned = np.zeros(n)
-    pinned[_far_apart(points)] = 1
+    pinned[_far_apart(nodes)] = 1
     factor = factorize(csr_array(normal + diags_array(pinned)))
 
-    target = h.value.T @ boundary
     corrected = list(h.gradient)
     for _ in range(2):  # the second time for the round-off of the first, which grows with the cloud's grading
         defect = target - np.column_stack([derivative.T @ volumes for derivative in corrected])

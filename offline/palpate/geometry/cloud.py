@@ -30,7 +30,9 @@ class NodeCloud:
 
     points   (n_nodes, 3), m
     normals  (n_nodes, 3), unit outward normals; zero at interior nodes
-    volumes  (n_nodes,), m³; they sum to the body's volume
+    volumes  (n_nodes,), m³, of the nodes' cells: the parts of the body nearest to them; they sum to the body's volume
+    centroids  (n_nodes, 3), m, of the cells
+    moments  (n_nodes, 3, 3), m²: the mean over the cell of (x - centroid) (x - centroid)^T
     areas    (n_nodes,), m²; zero at interior nodes, they sum to the body's surface
     boundary (n_nodes,), true on the boundary
     spacing  (n_nodes,), m; local distance between neighboring nodes, from which the support radius follows
@@ -41,6 +43,8 @@ class NodeCloud:
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
     volumes: NDArray[np.float64]
+    centroids: NDArray[np.float64]
+    moments: NDArray[np.float64]
     areas: NDArray[np.float64]
     boundary: NDArray[np.bool_]
     spacing: NDArray[np.float64]

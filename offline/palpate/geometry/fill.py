@@ -15,7 +15,7 @@ from palpate.geometry.measures import enclosed_volume, triangle_normals
 from palpate.geometry.sampling import Samples, closest_point, depth_inside, sample_elements, sample_inside
 from palpate.geometry.sharp_edges import sharp_edges
 from palpate.geometry.spacing import Refinement, SpacingField
-from palpate.geometry.tributary import nearest_node, tributary_measures
+from palpate.geometry.tributary import nearest_node, tributary_cells, tributary_measures
 from palpate.geometry.visibility import Gaps, find_gaps
 from palpate.scene.quantities import MAX_NODES
 
@@ -68,12 +68,14 @@ def fill_surface(
     areas, normals = np.zeros(len(points)), np.zeros_like(points)
     areas[:n_boundary], normals[:n_boundary] = _areas_and_normals(boundary, surface, field, gaps)
     samples = sample_inside(surface, field, _MEASURING)
+    sight = gaps.sight(samples.points)
+    cells = tributary_cells(points, samples.points, samples.measures, enclosed_volume(surface), sight)
     return NodeCloud(
         points=points,
         normals=normals,
-        volumes=tributary_measures(
-            points, samples.points, samples.measures, enclosed_volume(surface), gaps.sight(samples.points)
-        ),
+        volumes=cells.volumes,
+        centroids=cells.centroids,
+        moments=cells.moments,
         areas=areas,
         boundary=np.arange(len(points)) < n_boundary,
         spacing=field(points),

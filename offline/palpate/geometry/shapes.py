@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from palpate.geometry.cloud import NodeCloud, TriangleSurface
-from palpate.geometry.tributary import tributary_measures
+from palpate.geometry.tributary import Cells, tributary_cells, tributary_measures
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -45,9 +45,11 @@ def box_lattice(
     if jitter:
         shift = np.random.default_rng(seed).uniform(-jitter, jitter, points.shape) * step
         points = points + np.where(outer, 0.0, shift)
-        volumes = tributary_measures(points, *_midpoints(low, high, samples))
+        cells = tributary_cells(points, *_midpoints(low, high, samples))
     else:
-        volumes = np.prod(lengths, axis=1)
+        inward = ends[:, :, 0].astype(float) - ends[:, :, 1]
+        squares = lengths[:, :, None] ** 2 / 12 * np.eye(3)
+        cells = Cells(np.prod(lengths, axis=1), points + inward * step / 4, squares)
 
     normals, areas = np.zeros_like(points), np.zeros(len(points))
     for axis, side in itertools.product(range(3), range(2)):
@@ -68,7 +70,9 @@ def box_lattice(
     return NodeCloud(
         points=points,
         normals=normals,
-        volumes=volumes,
+        volumes=cells.volumes,
+        centroids=cells.centroids,
+        moments=cells.moments,
         areas=areas,
         boundary=boundary,
         spacing=np.full(len(points), step.max()),
@@ -94,6 +98,7 @@ def ball(radius_m: float, spacing_m: float) -> NodeCloud:
 
     fine = spacing_m / _SAMPLES_A_SPACING
     samples = _grid_in_ball(radius_m, fine, offset=0.5)
+    cells = tributary_cells(points, samples, np.ones(len(samples)), volume)
     skin = radius_m * _spiral(round(area / fine**2))
     areas = np.zeros(len(points))
     areas[on_surface] = tributary_measures(points[on_surface], skin, np.ones(len(skin)), area)
@@ -106,7 +111,9 @@ def ball(radius_m: float, spacing_m: float) -> NodeCloud:
     return NodeCloud(
         points=points,
         normals=normals,
-        volumes=tributary_measures(points, samples, np.ones(len(samples)), volume),
+        volumes=cells.volumes,
+        centroids=cells.centroids,
+        moments=cells.moments,
         areas=areas,
         boundary=on_surface,
         spacing=np.full(len(points), spacing_m),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import igl
 import igl.predicates
 import numpy as np
 from numpy.typing import NDArray
@@ -53,9 +54,9 @@ class Naming:
 def check_surface(surface: TriangleSurface, naming: Naming | None = None) -> None:
     """Raise SurfaceError unless the surface bounds one solid body.
 
-    That is: not empty, no triangle without area, closed, manifold, consistently oriented, in one piece (so no cavities and
-    no separate bodies), free of self-intersections, and with its normals pointing outward. All that fail are named, each
-    in its line.
+    That is: not empty, no triangle without area, closed, manifold, consistently oriented, free of self-intersections, and
+    with its normals pointing out of the body. It is in one piece, or others lie inside the largest and bound cavities. All
+    that fail are named, each in its line.
     """
     if naming is None:
         naming = Naming(vertices=np.arange(len(surface.vertices)))
@@ -92,9 +93,10 @@ def _faults(surface: TriangleSurface, naming: Naming) -> Iterator[str]:
             a, b = edges[np.argmax(fault)]
             where = naming.place(surface.vertices[[a, b]].mean(axis=0))
             yield f"is {what}: {fault.sum()} {description}, the first{naming.edge(a, b)} near {where}. {naming.mend}"
-    yield from _separate_pieces(surface, naming)
+    sound = bool(np.all(counts == 2) and not uneven.any())
+    yield from _separate_pieces(surface, naming, sound)
     volume = enclosed_volume(surface)
-    if np.all(counts == 2) and not uneven.any() and volume <= 0:
+    if sound and volume <= 0:
         yield (
             f"is inside-out: it encloses {volume:.3g} m³, expected its triangles counter-clockwise seen from outside. "
             f"{naming.mend}"
@@ -120,19 +122,55 @@ def edges_of(triangles: Indices) -> tuple[Indices, Indices, Indices]:
     return edges, counts, 2 * upward - counts
 
 
-def _separate_pieces(surface: TriangleSurface, naming: Naming) -> Iterator[str]:
+def _separate_pieces(surface: TriangleSurface, naming: Naming, sound: bool) -> Iterator[str]:
+    """Pieces that are no cavities of the largest one; in a surface that is not sound itself, all but one."""
     triangles, n = surface.triangles, len(surface.vertices)
     ends = np.concatenate([triangles[:, 1], triangles[:, 2]])
     graph = coo_array((np.ones(len(ends)), (np.tile(triangles[:, 0], 2), ends)), (n, n))
     _, label = connected_components(graph, directed=False)
-    pieces, sizes = np.unique(label[triangles[:, 0]], return_counts=True)
-    if len(pieces) > 1:
-        smallest = np.argmax(label[triangles[:, 0]] == pieces[np.argmin(sizes)])
-        where = naming.place(surface.vertices[triangles[smallest]].mean(axis=0))
-        yield (
-            f"has {len(pieces)} separate pieces, expected 1 (no cavities, no second body): the smallest has {sizes.min()} "
-            f"triangles near {where}. {naming.mend}"
-        )
+    pieces = [np.flatnonzero(label[triangles[:, 0]] == piece) for piece in np.unique(label[triangles[:, 0]])]
+    if len(pieces) == 1:
+        return
+    if not sound:
+        yield _told(pieces, f"has {len(pieces)} separate pieces, expected 1", surface, naming)
+        return
+    parts = [TriangleSurface(surface.vertices, triangles[piece]) for piece in pieces]
+    volumes = [enclosed_volume(part) for part in parts]
+    body = int(np.argmax(np.abs(volumes)))
+    places = np.array([surface.vertices[part.triangles[0, 0]] for part in parts])
+    inside = np.array(
+        [
+            np.abs(igl.winding_number(part.vertices, part.triangles.astype(np.int64), places)) > 0.5
+            for part in parts
+        ]
+    )  # [k]: which are inside part k
+    np.fill_diagonal(inside, False)
+    apart, nested, turned = [], [], []
+    for k in range(len(parts)):
+        if k == body:
+            continue
+        if not inside[body, k]:
+            apart.append(k)
+        elif inside[:, k].sum() > 1:
+            nested.append(k)
+        elif volumes[k] * volumes[body] > 0:
+            turned.append(k)
+    for found, fault in (
+        (apart, f"{len(apart) + 1} separate pieces, expected 1"),
+        (nested, f"{len(nested)} pieces inside its cavities, expected none"),
+        (
+            turned,
+            f"{len(turned)} cavities whose triangles face as the body's, expected them the other way round",
+        ),
+    ):
+        if found:
+            yield _told([pieces[k] for k in found], f"has {fault}", surface, naming)
+
+
+def _told(pieces: list[Indices], fault: str, surface: TriangleSurface, naming: Naming) -> str:
+    smallest = min(pieces, key=len)
+    where = naming.place(surface.vertices[surface.triangles[smallest[0]]].mean(axis=0))
+    return f"{fault}: the smallest has {len(smallest)} triangles near {where}. {naming.mend}"
 
 
 def _crossings(surface: TriangleSurface, solid: Indices, naming: Naming) -> Iterator[str]:

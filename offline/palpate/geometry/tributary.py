@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -51,6 +53,36 @@ def _nearest_in_sight(
     return owner
 
 
+@dataclass(frozen=True)
+class Cells:
+    """The parts of a body that nodes stand for.
+
+    volumes    (n_nodes,), m³; they sum to the body's volume
+    centroids  (n_nodes, 3), m
+    moments    (n_nodes, 3, 3), m²: the mean over the cell of (x - centroid) (x - centroid)^T
+    """
+
+    volumes: Array
+    centroids: Array
+    moments: Array
+
+
+def tributary_cells(
+    nodes: Array, samples: Array, weights: Array, total: float, sight: Sight | None = None
+) -> Cells:
+    """The Voronoi cells of the nodes within the sampled body. Arguments and errors as `tributary_measures`."""
+    owner = nearest_node(nodes, samples, sight)
+    shares = _shares(owner, nodes, weights)
+    moment = [np.bincount(owner, weights * x, minlength=len(nodes)) for x in samples.T]
+    centroids = np.column_stack(moment) / shares[:, None]
+    away = samples - centroids[owner]
+    moments = np.empty((len(nodes), 3, 3))
+    for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)):
+        second = np.bincount(owner, weights * away[:, a] * away[:, b], minlength=len(nodes)) / shares
+        moments[:, a, b] = moments[:, b, a] = second
+    return Cells(shares * (total / shares.sum()), centroids, moments)
+
+
 def tributary_measures(
     nodes: Array, samples: Array, weights: Array, total: float, sight: Sight | None = None
 ) -> Array:
@@ -64,11 +96,17 @@ def tributary_measures(
 
     Raises ValueError naming the first node without a share: the sampling is too coarse there.
     """
-    measures = np.bincount(nearest_node(nodes, samples, sight), weights, minlength=len(nodes))
-    empty = np.flatnonzero(measures <= 0)
+    shares = _shares(nearest_node(nodes, samples, sight), nodes, weights)
+    return shares * (total / shares.sum())
+
+
+def _shares(owner: NDArray[np.intp], nodes: Array, weights: Array) -> Array:
+    """(n_nodes,): the sum of the samples' weights that each node owns. Raises ValueError naming the first without any."""
+    shares = np.bincount(owner, weights.astype(np.float64), minlength=len(nodes)).astype(np.float64)
+    empty = np.flatnonzero(shares <= 0)
     if len(empty):
         raise ValueError(
             f"{len(empty)} of {len(nodes)} nodes have no share of the body, the first is node {empty[0]} at "
             f"{nodes[empty[0]].tolist()} m: expected nodes further apart, or a body that is thicker there"
         )
-    return measures * (total / measures.sum())
+    return shares

@@ -8,6 +8,7 @@ from palpate.discretization.nodal import nodal_basis
 from palpate.geometry.fill import fill_surface
 from palpate.geometry.shapes import ball, box_lattice
 from palpate.geometry.spacing import Refinement
+from palpate.meshfree import shape_functions
 from palpate.meshfree.kernel import quartic_spline
 
 
@@ -29,14 +30,16 @@ CLOUDS = _clouds()
 def test_the_correction_is_the_smallest_that_obeys_the_divergence_theorem(name):
     """Constrained least squares, assembled densely for one axis and solved by its pseudo-inverse."""
     cloud = CLOUDS[name]
-    basis, h = nodal_basis(cloud.points, cloud.spacing, 2.2, derivatives=1)
-    areas = vector_areas(cloud)
-    corrected = consistent_gradient(cloud.points, cloud.volumes, cloud.spacing, areas, h, basis.radii)
+    nodes, places, spacing = cloud.points, cloud.centroids, cloud.spacing
+    basis, _ = nodal_basis(nodes, spacing, 2.2, derivatives=0, gaps=cloud.gaps)
+    h = shape_functions(places, nodes, basis.radii, derivatives=1, gaps=cloud.gaps)
+    target = basis.value.T @ vector_areas(cloud)
+    corrected = consistent_gradient(nodes, places, cloud.volumes, spacing, target, h, basis.radii)
 
     n = cloud.n_nodes
     node = np.repeat(np.arange(n), np.diff(h.value.indptr))
     other = h.value.indices
-    offset = cloud.points[other] - cloud.points[node]
+    offset = cloud.points[other] - places[node]
     weight = quartic_spline(np.minimum(np.linalg.norm(offset, axis=1) / basis.radii[other], 1.0))
     linear = np.column_stack([np.ones(len(node)), offset / cloud.spacing[node, None]])
     # Unknowns y = change h / sqrt(W): each row's change is orthogonal to linear fields, the columns' sums are given.
@@ -49,7 +52,7 @@ def test_the_correction_is_the_smallest_that_obeys_the_divergence_theorem(name):
     constraints = np.vstack([exact, sums])
     scale = np.linalg.norm(constraints, axis=1, keepdims=True)
     constraints /= scale
-    defect = h.value.T @ areas - np.column_stack([plain.T @ cloud.volumes for plain in h.gradient])
+    defect = target - np.column_stack([plain.T @ cloud.volumes for plain in h.gradient])
     wanted = np.vstack([np.zeros((4 * n, 3)), defect]) / scale
     multipliers, *_ = np.linalg.lstsq(constraints @ constraints.T, wanted, rcond=1e-12)
     change = unit[:, None] * (constraints.T @ multipliers)

@@ -31,6 +31,19 @@ def two_boxes(second_lower, second_upper):
     return changed(merged, triangles)
 
 
+def boxes(*bounds):
+    """Boxes from lower to upper corner; one given as (upper, lower) has its triangles turned, as a cavity's are."""
+    vertices, triangles = [], []
+    for k, (a, b) in enumerate(bounds):
+        surface = box_lattice(min(a, b), max(a, b), (2, 2, 2)).surface
+        vertices.append(surface.vertices)
+        triangles.append((surface.triangles if a < b else surface.triangles[:, ::-1]) + 8 * k)
+    return changed(np.vstack(vertices), np.vstack(triangles))
+
+
+OUTER, HOLE, SECOND_HOLE = ((0, 0, 0), (9, 9, 9)), ((4, 4, 4), (1, 1, 1)), ((8, 8, 8), (5, 5, 5))
+
+
 def with_vertex_moved(corner, to):
     vertices = BOX.vertices.copy()
     vertices[np.all(vertices == corner, axis=1)] = to
@@ -54,6 +67,9 @@ REFUSED = {
     "non-manifold": (two_boxes((1, 2, 0), (2, 3, 3)), "not manifold: 1 edges with more than two triangles"),
     "inconsistent": (with_triangle_run_the_other_way(), "not oriented consistently: 3 edges"),
     "two bodies": (two_boxes((5, 5, 5), (6, 6, 6)), r"2 separate pieces, expected 1 .* 12 triangles near"),
+    "body in a cavity": (boxes(OUTER, HOLE, ((2, 2, 2), (3, 3, 3))), "1 pieces inside its cavities"),
+    "cavity turned": (boxes(OUTER, HOLE[::-1], SECOND_HOLE), "1 cavities whose triangles face as the body's"),
+    "inside-out with a cavity": (boxes(OUTER[::-1], HOLE[::-1]), "inside-out: it encloses -702 m³"),
     "inside-out": (changed(triangles=BOX.triangles[:, ::-1]), "inside-out: it encloses -6 m³"),
     "self-intersecting": (
         with_vertex_moved((0, 0, 0), (0.5, 1.0, 3.5)),
@@ -81,6 +97,13 @@ def test_a_sound_surface_passes():
     normals, areas = triangle_normals(BOX)
     assert areas.sum() == pytest.approx(22)
     np.testing.assert_allclose(areas @ normals, 0, atol=1e-13)
+
+
+@pytest.mark.parametrize("holes", [[HOLE], [HOLE, SECOND_HOLE]])
+def test_closed_surfaces_inside_the_body_are_cavities(holes):
+    surface = boxes(OUTER, *holes)
+    check_surface(surface)
+    assert enclosed_volume(surface) == pytest.approx(9**3 - 3**3 * len(holes))
 
 
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
