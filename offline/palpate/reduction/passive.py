@@ -289,7 +289,7 @@ def _fit_frequencies(full: PoleResidueSystem, sampling: Sampling) -> Array:
     top = min(0.998 * np.pi / sampling.period_s, max(3 * float(np.max(np.abs(full.poles))), 4 * end))
     slowest = min(float(np.min(full.poles.imag[full.is_pair], initial=end)), end)
     in_band = [np.linspace(0, end, 151)[1:], np.geomspace(slowest / 3, end, 50)]
-    above = [np.linspace(end, top, 250), np.geomspace(end, top, 125)]
+    above = [np.linspace(end, top, 900), np.geomspace(end, top, 125)]
     return np.unique(np.concatenate([*in_band, *above]))
 
 
