@@ -1,1 +1,1 @@
-"""Run a reduced tissue model at 1 kHz: displacements in, reaction forces out, over Zenoh."""
+"""Run a reduced tissue model at 1 kHz: tool positions in, forces out, over Zenoh."""

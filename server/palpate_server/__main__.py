@@ -11,7 +11,7 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-# The loop's process has no use for a pool of linear algebra threads; to be said before numpy is loaded.
+# The server needs no pool of linear algebra threads. This must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import zenoh
@@ -25,9 +25,9 @@ from palpate_server.realtime.safety import Limits, least_force_rate
 from palpate_server.session import log_limit, transport
 from palpate_server.session.loading import accuracy_warnings
 from palpate_server.session.server import (
-    FASTEST_SURFACE_HZ,
-    USUAL_RECORDINGS_BYTES,
-    USUAL_SURFACE_HZ,
+    DEFAULT_RECORDINGS_BYTES,
+    DEFAULT_SURFACE_HZ,
+    MAX_SURFACE_HZ,
     ServerOptions,
     serve,
 )
@@ -67,7 +67,7 @@ def _stop_at_signals() -> threading.Event:
 
 
 def _server_options(options: argparse.Namespace) -> ServerOptions:
-    """Raises ValueError for limits that can't be kept, and for a folder that is missing or can't be written to."""
+    """The options as the server takes them. Raises ValueError for a limit that is too low and for a folder that can't be used."""
     limits = Limits(
         options.max_force_n,
         options.max_force_rate_n_per_s,
@@ -107,7 +107,7 @@ def _announce(model: ReducedModel, keys: Keys, options: argparse.Namespace) -> N
 
 
 def _prepare_folder(option: str, folder: Path) -> None:
-    """Make a folder unless it is there. Raises ValueError when that can't be, or nothing may be written to it."""
+    """Make a folder unless it exists. Raises ValueError if that fails or if the folder is not writable."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -142,27 +142,30 @@ def _parser() -> argparse.ArgumentParser:
         help="Zenoh configuration (JSON5), used as it is: TLS, access control, routers",
     )
     for name, text in (
-        ("--models", "where clients may load other models from (default: the folder of MODEL.npz)"),
-        ("--black-box", "write the last two seconds there after a fault, a stale input or a storm of limits"),
+        ("--models", "folder that clients may load other models from (default: that of MODEL.npz)"),
+        (
+            "--black-box",
+            "folder for the last two seconds of ticks after a fault, a lost or silent client, or a storm of limits",
+        ),
         (
             "--recordings",
-            "where clients may have the session recorded to (extra `recorder`; default: they may not)",
+            "folder for recordings that clients ask for (extra `recorder`; default: no recordings)",
         ),
     ):
         parser.add_argument(name, type=Path, metavar="FOLDER", help=text)
     parser.add_argument(
         "--max-recordings-gb",
         type=positive,
-        default=USUAL_RECORDINGS_BYTES / 1e9,
+        default=DEFAULT_RECORDINGS_BYTES / 1e9,
         metavar="GB",
-        help="what the folder of recordings may hold (default: %(default)s)",
+        help="largest size of the folder of recordings (default: %(default)s)",
     )
     parser.add_argument(
         "--surface-hz",
         type=_surface_rate,
-        default=USUAL_SURFACE_HZ,
+        default=DEFAULT_SURFACE_HZ,
         metavar="HZ",
-        help="how often the surface is sent while somebody listens, up to 60 (default: %(default)s)",
+        help=f"surfaces a second while somebody subscribes, up to {MAX_SURFACE_HZ:g} (default: %(default)s)",
     )
     parser.add_argument(
         "--cpu",
@@ -185,8 +188,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _surface_rate(text: str) -> float:
     value = positive(text)
-    if value > FASTEST_SURFACE_HZ:
-        raise argparse.ArgumentTypeError(f"{text} is above {FASTEST_SURFACE_HZ:g}")
+    if value > MAX_SURFACE_HZ:
+        raise argparse.ArgumentTypeError(f"{text} is above {MAX_SURFACE_HZ:g}")
     return value
 
 

@@ -57,8 +57,8 @@ def make_body(system: StateSpace, displacement: Floats | None = None) -> StateSp
     )
 
 
-def nothing(n_channels: int) -> StateSpaceBody:
-    """A body without states that answers nothing."""
+def empty_body(n_channels: int) -> StateSpaceBody:
+    """A body without states, whose force is zero."""
     n = n_channels
     return make_body(
         StateSpace(np.zeros(0), np.zeros(0), np.zeros((0, n)), np.zeros((n, 0)), np.zeros((n, n)))

@@ -34,7 +34,7 @@ class FixedPatch(NamedTuple):
         return len(self.body.state) + len(self.following.state) + len(self.fade)
 
     def restore(self, state: Floats) -> None:
-        """Take up a state that `save` gave, of a coupling of the same models. Raises ValueError for another size."""
+        """Restore a state that `save` wrote, of a coupling with the same models. Raises ValueError for another size."""
         if state.shape != (self.state_size(),):
             raise ValueError(f"state has shape {state.shape}: expected ({self.state_size()},)")
         order = len(self.body.state)
@@ -44,12 +44,12 @@ class FixedPatch(NamedTuple):
 
 
 def make(system: StateSpace) -> FixedPatch:
-    """A body at rest, with no other to follow."""
-    return FixedPatch(state_space.make_body(system), state_space.nothing(len(system.c)), np.zeros(2))
+    """A coupling with a body at rest."""
+    return FixedPatch(state_space.make_body(system), state_space.empty_body(len(system.c)), np.zeros(2))
 
 
-def fade_over(running: FixedPatch, system: StateSpace, displacement: Floats, step: float) -> FixedPatch:
-    """The coupling that fades over to another model, whose body begins settled at `displacement` (n_tools, 3), m.
+def cross_fade(running: FixedPatch, system: StateSpace, displacement: Floats, step: float) -> FixedPatch:
+    """The coupling that cross-fades to another model, whose body begins settled at `displacement` (n_tools, 3), m.
 
     step: by how much the share of its force grows each tick
     """
@@ -57,9 +57,9 @@ def fade_over(running: FixedPatch, system: StateSpace, displacement: Floats, ste
     return FixedPatch(running.body, following, np.array([0.0, step]))
 
 
-def faded_over(fading: FixedPatch) -> FixedPatch:
-    """The coupling to go on with when the fading is over: that of the following body alone."""
-    return FixedPatch(fading.following, state_space.nothing(len(fading.body.force)), np.zeros(2))
+def after_cross_fade(fading: FixedPatch) -> FixedPatch:
+    """The coupling after the cross-fade: of the following body alone."""
+    return FixedPatch(fading.following, state_space.empty_body(len(fading.body.force)), np.zeros(2))
 
 
 # For compiled code; see `palpate_server.coupling`.

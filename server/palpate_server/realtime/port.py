@@ -28,9 +28,9 @@ _JUMPED = int(Flags.JUMPED)
 
 @compiled
 def move(port: Record, settings: Record, command: Record, age: int, period_ns: int) -> int:
-    """Move the tip to where the command wants it, as far as it is allowed, and fade the force in or out; the flags.
+    """Move the tip to the command's position, within the limits, and fade the force in or out. Returns the flags.
 
-    command (COMMAND) is `age` ns old, -1 when there is none.
+    command (COMMAND) is `age` ns old; -1 if there is none.
     """
     flags = 0
     known = age >= 0
@@ -43,13 +43,13 @@ def move(port: Record, settings: Record, command: Record, age: int, period_ns: i
             flags |= _HELD
         safety.reconstruct(command.position_m, command.velocity_m_per_s, age, port.position_m)
     elif has_faded(port):
-        # Nobody feels it any more: withdraw the tip, so that the tissue comes to rest.
+        # The force is zero: withdraw the tip, so that the tissue comes to rest.
         for j in range(3):
             port.position_m[j] = port.device_m[j] = settings.home_m[j]
         port.energy_j = 0.0
     moved = live and safety.all_finite(port.position_m)
     for j in range(3):
-        # Energy goes through the port as the device moves, also while the tip is slower.
+        # Energy passes the port with the motion of the device, even if the tip follows more slowly.
         port.step_m[j] = port.position_m[j] - port.device_m[j] if moved else 0.0
         if moved:
             port.device_m[j] = port.position_m[j]
@@ -62,9 +62,9 @@ def move(port: Record, settings: Record, command: Record, age: int, period_ns: i
         settings.max_speed_m_per_s * safety.HOLD_NS * 1e-9,
     )
     if not live:
-        flags &= ~_JUMPED  # that is our own withdrawal
+        flags &= ~_JUMPED  # the jump is the withdrawal of the tip, not the client's
     elif flags & _SPEED_LIMITED and port.flags & _JUMPED:
-        flags |= _JUMPED  # still on its way
+        flags |= _JUMPED  # the tip is still on its way
     port.force_scale = safety.fade(port.force_scale, live and not flags & _JUMPED, period_ns)
     if not live:
         flags |= _DECAYING
@@ -75,7 +75,7 @@ def move(port: Record, settings: Record, command: Record, age: int, period_ns: i
 
 @compiled
 def render(port: Record, settings: Record, model_force: Floats, period_s: float) -> int:
-    """Turn the tissue's force on the tip, (3,), N, in the model's frame, into what the device renders; the flags."""
+    """Turn the tissue's force on the tip, (3,), N, in the model's frame, into the device's force. Returns the flags."""
     force = port.raw_force_n
     frames.to_device(settings.rotation, settings.scale, model_force, force)
     for j in range(3):
@@ -88,7 +88,7 @@ def render(port: Record, settings: Record, model_force: Floats, period_s: float)
         settings.max_damping_n_s_per_m * port.force_scale,
         period_s,
     )
-    # The largest force fades too: else the fading of a force far above it would show only at its very end.
+    # The largest force fades too. Otherwise a force far above it would begin to fade only at the very end.
     flags |= safety.bound(
         force,
         port.force_n,
@@ -108,7 +108,7 @@ def render(port: Record, settings: Record, model_force: Floats, period_s: float)
 
 @compiled
 def finish(port: Record, flags: int) -> None:
-    """Keep the flags of the tick; a force that has faded is STALE."""
+    """Store the flags of the tick, with STALE instead of DECAYING once the force has faded."""
     if flags & _DECAYING and has_faded(port):
         flags ^= _DECAYING | _STALE
     port.flags = flags
@@ -116,7 +116,7 @@ def finish(port: Record, flags: int) -> None:
 
 @compiled
 def put_to_rest(port: Record, home: Floats) -> None:
-    """Put the tip to its start, the client position `home` (3,); nothing has gone through the port."""
+    """Move the tip to its start, the client position `home` (3,), m, and set the energy to zero."""
     for j in range(3):
         port.position_m[j] = port.applied_m[j] = home[j]
     port.energy_j = 0.0
@@ -124,6 +124,6 @@ def put_to_rest(port: Record, home: Floats) -> None:
 
 @compiled
 def has_faded(port: Record) -> bool:
-    """Whether the force is zero, and stays so until it fades in again."""
+    """Whether the force has faded to zero."""
     force = port.force_n
     return port.force_scale == 0.0 and force[0] == 0.0 and force[1] == 0.0 and force[2] == 0.0

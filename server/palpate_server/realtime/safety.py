@@ -67,7 +67,7 @@ def is_finite(value: float) -> bool:
 def follow(
     target: Floats, applied: Floats, home: Floats, workspace_radius: float, max_step: float, jump: float
 ) -> int:
-    """Move `applied` (3,) towards `target` (3,) by at most `max_step`, inside the workspace; the flags.
+    """Move `applied` (3,) towards `target` (3,) by at most `max_step`, inside the workspace. Returns the flags.
 
     The workspace is a ball around `home` (3,). Sets JUMPED if the distance exceeds `jump`. `applied` is changed in place;
     it stays when `target` is not finite. All in m.
@@ -117,7 +117,7 @@ def all_finite(values: Floats) -> bool:
 def keep_passive(
     energy: float, rendered: Floats, step: Floats, force: Floats, max_damping: float, period_s: float
 ) -> tuple[float, int]:
-    """Time-domain passivity observer and controller (Hannaford & Ryu 2002); the energy so far (J), and flags.
+    """Time-domain passivity observer and controller (Hannaford & Ryu 2002). Returns the energy so far, J, and the flags.
 
     `rendered` (3,) is the force on the device while it moved by `step` (3,). A device holds its force between updates, so
     the port took in exactly -rendered · step. When more came out than went in, `force` (3,) gets a damping that takes
@@ -135,7 +135,7 @@ def keep_passive(
 
 @compiled
 def bound(force: Floats, previous: Floats, max_change: float, max_magnitude: float) -> int:
-    """Limit `force` (3,) in place: its change from `previous` (3,), then its magnitude; the flags.
+    """Limit `force` (3,) in place: its change from `previous` (3,), then its magnitude. Returns the flags.
 
     The limit of the change always holds. With |previous| <= max_magnitude the magnitude holds too: projecting on a ball
     moves no two points apart. A previous force above `max_magnitude`, which was lowered, first decreases along its

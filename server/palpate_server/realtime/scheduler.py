@@ -1,15 +1,15 @@
 """When ticks run: exactly one step each period, on the arrival of a command or else at its deadline.
 
-Deadlines lie one period apart on the monotonic clock. A tick runs when a command arrives shortly before its deadline,
-so that the answer leaves at once; otherwise a compiled loop that never needs the GIL runs it at the deadline. Whoever
-comes first takes the tick lock; the other finds the deadline moved on. The deadlines slowly shift so that a steady
-client's commands arrive a quarter of a period before them.
+Deadlines are one period apart on the monotonic clock. A tick runs when a command arrives less than half a period before its
+deadline, so that the answer is sent at once; otherwise a compiled loop without the GIL runs it at the deadline. The thread that
+takes the tick lock first runs the tick and moves the deadline on. The deadlines slowly shift until a steady client's commands
+arrive a quarter of a period before them.
 
-Nobody else ever takes that lock: limits, frames, a reset or another model are left in a slot, and the next tick takes
-them out of it before it begins. So no thread of ordinary priority can hold a tick up.
+No other thread takes that lock: new limits, frames, a reset or another model are written to a slot, and the next tick applies them
+before it begins. So no thread of ordinary priority can delay a tick.
 
-A tick that is missed is made up for at once with the newest input, up to MAX_CATCH_UP of them; what is missed beyond
-that is skipped: model time then stands still, and the skipped ticks are counted.
+When ticks are missed, up to MAX_CATCH_UP are run at once with the newest input. The others are skipped and counted; they take
+no model time.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from palpate_server.realtime.shared_memory import (
 from palpate_server.realtime.tick import count, put_to_rest, run_tick
 
 MAX_CATCH_UP = 20
-_RETRY_NS = 20_000  # the deadline loop's nap while the other side runs the tick
+_RETRY_NS = 20_000  # how long the deadline loop sleeps while the other thread runs the tick
 _PHASE_SHIFT_NS = 2_000  # the most that the deadlines move in a tick: 0.2 % of a millisecond
 _PHASE_GAIN = 16
 
@@ -65,7 +65,7 @@ _eventfd_write: Any = types.ExternalFunction("eventfd_write", int32(int32, uint6
 
 @compiled
 def hand_over(image: Image, n_tools: int) -> int:
-    """Like `arrive`, but without a tick, for replays and tests; zero, or minus the reason's index."""
+    """As `arrive`, but without a tick, for tests and benchmarks. Returns zero, or minus the reason's index."""
     m = view(image)
     refused = _check(m.commands, n_tools)
     if not refused:
@@ -75,7 +75,7 @@ def hand_over(image: Image, n_tools: int) -> int:
 
 @compiled
 def _check(commands: Commands, n_tools: int) -> int:
-    """Zero, or why a message is refused as a whole."""
+    """Check all commands of one message. Returns zero, or minus the index of the reason in REFUSALS."""
     worst = 0
     for k in range(n_tools):
         command = commands.incoming[k]
@@ -96,7 +96,7 @@ def _check(commands: Commands, n_tools: int) -> int:
 
 @compiled
 def _hand_over(commands: Commands, n_tools: int) -> None:
-    """Put the incoming commands of one message where ticks find them: no tick comes in between."""
+    """Store the incoming commands of one message as the newest, under the sequence lock: a tick reads all or none."""
     begin_write(commands.versions, 0)
     for k in range(n_tools):
         tool = commands.incoming[k].tool
@@ -123,7 +123,7 @@ def is_silent(image: Image, tool: int) -> bool:
     return has_faded(view(image).ports[tool])
 
 
-# One thread at a time leaves a change in the slot and waits for it with `is_changed`.
+# One thread at a time writes a change to the slot, and waits for it with `is_changed`.
 
 
 @compiled
@@ -167,14 +167,14 @@ def _prepare(m: Memory, tool: int) -> Record:
 def reset(image: Image) -> None:
     """Ask for the body and all tips to be put to rest; every force fades in again.
 
-    A force that a device is rendering is not forgotten: it comes down at the allowed rate.
+    A force that a device renders at that moment decreases at the allowed rate.
     """
     store_release(view(image).shared, CHANGE, Change.RESET)
 
 
 @compiled
 def exchange(image: Image, replacement: Image) -> None:
-    """Ask the loop to go on with another memory: the same one with another coupling."""
+    """Ask the loop to continue with another memory: the same arrays with another coupling."""
     m = view(image)
     m.changes.image[:] = replacement
     store_release(m.shared, CHANGE, Change.EXCHANGE)
@@ -194,7 +194,7 @@ def is_changed(image: Image) -> bool:
 
 @compiled
 def withdraw_change(image: Image) -> bool:
-    """Take the change out of the slot again; False when a tick has taken it up already."""
+    """Remove the change from the slot. Returns False if a tick has taken it already."""
     m = view(image)
     kind = load_acquire(m.shared, CHANGE)
     return kind > Change.NONE and compare_and_swap(m.shared, CHANGE, kind, Change.NONE)
@@ -202,9 +202,9 @@ def withdraw_change(image: Image) -> bool:
 
 @compiled
 def take_up_change(image: Image) -> None:
-    """Carry out what is in the slot, and save the state. Called with the tick lock held, or in a replay.
+    """Carry out the change in the slot, and save the state. Called with the tick lock held, or in a replay.
 
-    Afterwards the image may be another.
+    The content of the image may be replaced.
     """
     m = view(image)
     kind = load_acquire(m.shared, CHANGE)
@@ -216,7 +216,7 @@ def take_up_change(image: Image) -> None:
         m.settings[tool] = changes.settings[0]
     elif kind == Change.FRAME:
         m.settings[tool] = changes.settings[0]
-        for j in range(3):  # after a reset, though, the device is where it was
+        for j in range(3):  # not so after a reset, where the device has not moved
             m.ports[tool].device_m[j] = m.settings[tool].home_m[j]
         put_to_rest(m, tool)
     elif kind == Change.RESET:
@@ -251,17 +251,17 @@ def repeat_tick(image: Image, deadline_ns: int, start_ns: int, missed: bool) -> 
 
 @compiled
 def _tick_on_arrival(image: Image, arrival_ns: int) -> int:
-    """A command came at `arrival_ns`: run the tick if its deadline is near, and pull the deadlines towards it."""
+    """Run the tick if its deadline is near, and shift the deadlines towards this command. Returns the number of ticks."""
     m = view(image)
     if not compare_and_swap(m.shared, LOCK, 0, 1):
-        return 0  # the deadline loop is at it; the command is in its slot for this tick or the next
+        return 0  # the deadline loop runs the tick; the command is used by this tick or the next
     counters = m.counters[0]
     period = m.period_ns[0]
     deadline = m.shared[DEADLINE_NS]
     half = period // 2
     error = (arrival_ns + period // 4 - deadline + half) % period - half
     before = counters.ticks
-    if counters.shifted_at != before:  # of a burst for one tick, the first counts
+    if counters.shifted_at != before:  # only the first command of a tick shifts the deadlines
         counters.shifted_at = before
         deadline += min(max(error // _PHASE_GAIN, -_PHASE_SHIFT_NS), _PHASE_SHIFT_NS)
         store_release(m.shared, DEADLINE_NS, deadline)
@@ -277,9 +277,9 @@ def _tick_on_arrival(image: Image, arrival_ns: int) -> int:
 
 @compiled
 def arrive(image: Image, n_tools: int) -> int:
-    """Hand over the first `n_tools` of the incoming commands, which are one message, and run the tick if it is near.
+    """Check the first `n_tools` incoming commands, one message; store them as the newest; run the tick if its deadline is near.
 
-    The number of ticks that ran; or, below zero, minus the index of the reason in REFUSALS: then nothing is handed over.
+    Returns the number of ticks that ran; or minus the index of the reason in REFUSALS, and then nothing is stored.
     One thread at a time may fill Commands.incoming and call this.
     """
     m = view(image)
@@ -292,14 +292,14 @@ def arrive(image: Image, n_tools: int) -> int:
 
 @compiled_without_gil
 def run_at_deadlines(image: Image, event_fd: int) -> None:
-    """Run every tick that no command has triggered, waking whoever reads `event_fd`; until STOP is set."""
+    """Run every tick that no command has triggered, and write to the eventfd `event_fd` after it, until STOP is set."""
     m = view(image)
     counted = 0
     while load_acquire(m.shared, STOP) == 0:
         deadline = load_acquire(m.shared, DEADLINE_NS)
         sleep_until(deadline)
         now = monotonic_ns()
-        if deadline > counted:  # once a deadline, also when the tick is already done or must wait
+        if deadline > counted:  # once for each deadline, even if its tick already ran or must wait
             count(m, TIMER_LATENESS, now - deadline)
             counted = deadline
         if load_acquire(m.shared, DEADLINE_NS) > now:
@@ -307,7 +307,7 @@ def run_at_deadlines(image: Image, event_fd: int) -> None:
         if compare_and_swap(m.shared, LOCK, 0, 1):
             if m.shared[DEADLINE_NS] <= now:
                 take_up_change(image)
-                _run_due_ticks(view(image), now)  # the image is another after an exchange
+                _run_due_ticks(view(image), now)  # after an exchange the image has changed
             store_release(m.shared, LOCK, 0)
             _eventfd_write(event_fd, 1)
         else:
@@ -344,7 +344,7 @@ def read_snapshot(image: Image, state: Floats, displacement: Floats) -> int:
 
 @compiled
 def _run_due_ticks(m: Memory, now: int) -> None:
-    """Run the next tick, and with it those whose deadlines have passed since. Called with the lock held."""
+    """Run the next tick and all others whose deadlines have passed. Called with the lock held."""
     period = m.period_ns[0]
     deadline = m.shared[DEADLINE_NS]
     due = 1

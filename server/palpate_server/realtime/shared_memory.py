@@ -1,4 +1,4 @@
-"""All that ticks and the threads around them share: arrays that are made once."""
+"""The arrays that ticks and other threads share. They are allocated once."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Integers = NDArray[np.int64]
 Records = NDArray[np.void]
 Coupling = FixedPatch
 
-HISTOGRAM_BINS = 10_000  # of a microsecond; the last one also holds what is longer
+HISTOGRAM_BINS = 10_000  # one microsecond each; the last one counts all longer durations
 
 # Elements of Memory.shared, which all sides load and store atomically. CHANGE is a records.Change while it waits.
 LOCK, DEADLINE_NS, STOP, HEAD, CHANGE = range(5)
@@ -42,10 +42,10 @@ class Commands(NamedTuple):
     """The newest command of each tool, handed over under a sequence lock.
 
     versions  (1,), of that lock
-    lease     (n,), the number of the present hold, which grows when it ends: commands of another one are not used
+    lease     (n,), the number of the present hold, increased when the hold ends; commands of another hold are discarded
     newest    (n,) COMMAND
     incoming  (n,) COMMAND: the commands of one message on their way in
-    accepted  (n,), how many there were
+    accepted  (n,), number of commands so far
     """
 
     versions: Integers
@@ -58,7 +58,7 @@ class Commands(NamedTuple):
 class Changes(NamedTuple):
     """The slot for one change between two ticks.
 
-    port (1,), its index; settings (1,) SETTINGS, of that port; image: of the memory to go on with
+    port (1,), its index; settings (1,) SETTINGS, of that port; image: of the memory to continue with
     """
 
     port: Integers
@@ -67,7 +67,7 @@ class Changes(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """The state between two ticks, saved by every change: with it, what follows can be repeated.
+    """The state between two ticks, saved by every change. A replay begins from it.
 
     counters (1,) COUNTERS; used (n,) COMMAND; settings (n,) SETTINGS; ports (n,) PORT; state, of the coupling
     """
@@ -107,7 +107,7 @@ class Memory(NamedTuple):
     counters      (1,) COUNTERS, written under the tick lock alone
     histograms    (4, HISTOGRAM_BINS) counts of durations, and longest_ns (4,)
     settings      (n,) SETTINGS
-    commands      what clients want
+    commands      the newest of each tool
     read, used    (n,) COMMAND: a read that may be torn, and the commands of this tick
     ports         (n,) PORT
     displacement, force  (n, 3), m and N, in the model's frame: from the ports to the coupling and back

@@ -1,4 +1,4 @@
-"""What the operating system can do for the loop where it allows it: real-time priority, locked memory."""
+"""Real-time priority, locked memory and processor affinity, where the operating system allows them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ import os
 import resource
 import sys
 
-# Priorities of SCHED_FIFO (1 to 99), above ordinary threads and below the kernel's own. The thread that receives commands
-# runs ticks too: its priority is high, so that no ordinary thread can interrupt a tick that the loop has to wait for.
-# Zenoh's threads keep the links alive and carry the messages; they need little time, but need it within the lease. The
-# threads that answer queries and send status and surface come last: while one of them holds the GIL and waits for a
-# processor, commands wait for the GIL.
+# Priorities of SCHED_FIFO (1 to 99), above ordinary threads and below the kernel's. The thread that receives commands runs ticks
+# too, and the loop may wait for one of them, so no ordinary thread may interrupt it. Zenoh's threads keep the links alive and
+# carry the messages: they need little time, but within the lease. The threads for queries, status and surface come last. They
+# need a priority because a thread that waits for a processor may hold the GIL, for which commands then wait.
 LOOP_PRIORITY = 80
 COMMAND_PRIORITY = 70
 ZENOH_PRIORITY = 5
 SERVICE_PRIORITY = 2
-_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # on fault: only pages that are used take memory
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # on fault: lock a page when it is first used
 _SWITCH_INTERVAL_S = 1e-4  # of Python threads
 
 
@@ -57,8 +56,8 @@ def lock_memory() -> str | None:
     return None
 
 
-def calm_interpreter() -> None:
-    """Exclude all existing objects from garbage collection, and shorten the time until a waiting Python thread runs."""
+def tune_interpreter() -> None:
+    """Shorten pauses: exclude all existing objects from garbage collection, and switch Python threads more often."""
     gc.collect()
     gc.freeze()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)

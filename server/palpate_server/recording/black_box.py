@@ -1,4 +1,4 @@
-"""The last two seconds of ticks, written to a file when something went wrong in them."""
+"""Writes the last two seconds of ticks to a file after a fault."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from palpate_server.realtime.shared_memory import Integers, Memory
 log = logging.getLogger("palpate_server")
 
 KEPT_TICKS = 2000
-STORM_TICKS = 1000  # in so many ticks,
-STORM_SHARE = 0.5  # so large a share with a limit met is a storm
-MOST_FILES = 100  # of a server, however long it runs
+STORM_TICKS = 1000  # a storm of limits: in STORM_TICKS ticks
+STORM_SHARE = 0.5  # this share of the ticks met a limit
+MOST_FILES = 100  # in the life of a server
 QUIET_S = 10.0  # between two files of one cause
 
 _LIMITED = int(
@@ -54,7 +54,7 @@ class BlackBox:
         self._last_file_s: dict[str, float] = {}
 
     def examine(self, lost_clients: int = 0) -> threading.Thread | None:
-        """The thread that writes a file, when there was cause for one. `lost_clients`: how many so far."""
+        """Look at the ticks since the last call. Returns the thread that writes a file, if there is cause; lost_clients: how many so far."""
         head = int(scheduler.records_written(self.memory.shared))
         first = max(self._seen, head - RECORDS // 2, 0)
         cause = self._cause(first, head, lost_clients)
@@ -77,7 +77,7 @@ class BlackBox:
         if np.any(flags & int(Flags.FAULT)):
             return "fault"
         was_lost, self._lost_clients = self._lost_clients > self._lost_written, lost_clients
-        if was_lost:  # seen the last time, so that by now the fading of the force is among the ticks
+        if was_lost:  # noticed at the last call, so that these ticks hold the fading of the force
             self._lost_written = self._lost_clients
             return "lost"
         if first == head:

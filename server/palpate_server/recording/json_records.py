@@ -1,4 +1,4 @@
-"""Records as JSON objects and back: what a recording holds of them."""
+"""Records as JSON objects, for recordings, and back."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FULL = "the folder of recordings holds as much as it may"  # why a recording is refused or ends
+FULL = "the folder of recordings has reached its size limit"  # why a recording is refused or ends
 
 
 def as_objects(records: NDArray[np.void]) -> list[dict[str, Any]]:

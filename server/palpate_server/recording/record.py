@@ -1,4 +1,4 @@
-"""Have a running server record its session to an MCAP file, until Ctrl-C.
+"""Make a running server record its ticks to an MCAP file, until Ctrl-C.
 
     palpate record NAME.mcap [--connect ENDPOINT] [--session NAME] [--duration-s S]
 

@@ -1,8 +1,7 @@
-"""A recording that the server makes of itself: ticks, settings and status, handed through a pipe to a process that writes.
+"""A recording of the running server: sends ticks, settings and status through a pipe to a process that writes the file.
 
-Nothing of it can hold the loop up. A thread of its own takes the ticks out of the loop's ring, some times a second, and
-never waits for the pipe. When the process falls too far behind or ends (a full disk), the recording is over and the server
-goes on.
+It can't delay the loop. A thread of its own copies the ticks from the loop's ring every PERIOD_S and never blocks on the pipe. If
+the process falls too far behind or ends (a full disk), the recording ends and the server continues.
 """
 
 from __future__ import annotations
@@ -33,17 +32,17 @@ from palpate_server.recording.json_records import FULL
 
 log = logging.getLogger("palpate_server")
 
-LEAST_BYTES = 2**20  # room for a recording worth the name
+LEAST_BYTES = 2**20  # a recording with less room is refused
 PERIOD_S = 0.05
-MAX_UNWRITTEN_BYTES = 16 * 2**20  # bytes: half a minute of a tool
-END_S = 8.0  # to write the rest and end the file: on a busy machine its process is last in the queue
-_LAST_WORDS_S = 1.0  # of a process that has closed its pipe
-_PIPE_BYTES = 65536  # that a pipe takes at once
+MAX_UNWRITTEN_BYTES = 16 * 2**20  # half a minute of one tool
+END_S = 8.0  # to write the rest and complete the file; on a busy machine the process gets little time
+_EXIT_S = 1.0  # until a process that has closed its pipe must have ended
+_PIPE_BYTES = 65536  # capacity of a pipe
 _TOO_SLOW = "it can't be written as fast as it comes"
 
 
 def file_in(folder: Path, name: object) -> Path:
-    """Where a client's recording goes. Raises Refused when that is no plain, printable name of an MCAP file."""
+    """The path of a recording. Raises Refused unless `name` is a plain, printable name of an MCAP file."""
     if not is_plain_name(name) or not name.isprintable() or not name.endswith(".mcap") or name == ".mcap":
         raise Refused(
             "bad_file",
@@ -54,7 +53,7 @@ def file_in(folder: Path, name: object) -> Path:
 
 
 def room_in(folder: Path, max_bytes: int) -> int:
-    """How many bytes a new recording may have. Raises Refused when that is too few."""
+    """How many bytes a new recording may have. Raises Refused if less than LEAST_BYTES are left."""
     used = sum(entry.stat(follow_symlinks=False).st_size for entry in os.scandir(folder))
     if max_bytes - used < LEAST_BYTES:
         raise Refused("full", f"{FULL}: {used} of {max_bytes} bytes; remove old recordings")
@@ -62,15 +61,15 @@ def room_in(folder: Path, max_bytes: int) -> int:
 
 
 class _EndedEarlyError(Exception):
-    """The recording is over before it was asked to be; the message says why."""
+    """The recording ended before it was asked to; the message says why."""
 
 
 class Recorder:
-    """One recording, from its making to `stop`. Its ticks begin with the first settings that it is given.
+    """One recording, until `stop`. Its ticks begin with the first settings that it is given.
 
     messages       how many are in the file
     missing_ticks  ticks that were overwritten before they were taken
-    error          why it has ended before it was asked to, or None
+    error          why it ended before it was asked to, or None
     """
 
     def __init__(
@@ -84,7 +83,7 @@ class Recorder:
     ) -> None:
         """A new file of at most `max_bytes`. Raises Refused when the file exists or can't be made.
 
-        save: has the loop save its state and `settings` called with it, or raises Refused; called after missing ticks
+        save: has the loop save its state and calls `settings` with it, or raises Refused; called after missing ticks
         """
         self.file = path.name
         self.messages = 0
@@ -94,13 +93,13 @@ class Recorder:
         self._memory = memory  # its ring stays the same when the model is exchanged
         self._save = save
         self._next_tick: int | None = None
-        self._told: queue.SimpleQueue[tuple[str, int, bytes]] = queue.SimpleQueue()
+        self._queued: queue.SimpleQueue[tuple[str, int, bytes]] = queue.SimpleQueue()
         self._settings: dict[int, bytes] = {}  # by tick, until that tick is taken
         self._unwritten = bytearray()
         self._clock_offset_ns = time.time_ns() - time.monotonic_ns()
         self._ending = threading.Event()
-        self._line = b""  # of the process, not complete yet
-        self._last_words = ""
+        self._line = b""  # incomplete line from the process
+        self._failure = ""
         self._add("describe", pack(description))
         self._process = _start(path, max_bytes)
         assert self._process.stdin is not None
@@ -115,12 +114,12 @@ class Recorder:
     def settings(self, message: dict[str, Any]) -> None:
         """The state after a change, of `snapshot.as_message`; any thread may call this."""
         if self.error is None:
-            self._told.put(("settings", message["tick"], pack(message)))
+            self._queued.put(("settings", message["tick"], pack(message)))
 
     def status(self, payload: bytes) -> None:
         """Any thread may call this."""
         if self.error is None:
-            self._told.put(("status", 0, payload))
+            self._queued.put(("status", 0, payload))
 
     def stop(self) -> None:
         """Write what is left and end the file, in a few seconds at most; `report` is then final."""
@@ -144,7 +143,7 @@ class Recorder:
                     raise _EndedEarlyError(_TOO_SLOW)
             self.collect()
             self._finish()
-        except Exception as error:  # whatever it was: the recording is over, and says so
+        except Exception as error:  # any error ends the recording and is reported
             self.error = str(error)
             log.warning("recording %s has ended: %s", self.file, error)
         finally:
@@ -152,9 +151,9 @@ class Recorder:
             self._process.poll()
 
     def collect(self) -> None:
-        """Take what is new out of the ring; its thread does each PERIOD_S. Settings stand before the first tick with them."""
-        while not self._told.empty():
-            kind, tick, payload = self._told.get_nowait()
+        """Copy the new ticks from the ring, each settings message before its first tick. The thread calls this every PERIOD_S."""
+        while not self._queued.empty():
+            kind, tick, payload = self._queued.get_nowait()
             if kind == "settings":
                 self._settings[tick] = payload
                 if self._next_tick is None:
@@ -170,7 +169,7 @@ class Recorder:
         head = int(scheduler.records_written(shared))
         numbers = np.arange(max(self._next_tick, head - RECORDS), head)
         ticks, ports = ring.ticks[numbers % RECORDS], ring.ports[numbers % RECORDS]
-        # The loop went on meanwhile: of the oldest rows some may be another tick's already.
+        # The loop has run meanwhile: some of the oldest rows may hold newer ticks already.
         oldest = max(self._next_tick, int(scheduler.records_written(shared)) - RECORDS + 1)
         if missing := min(oldest, head) - self._next_tick:
             self.missing_ticks += missing
@@ -179,11 +178,11 @@ class Recorder:
         first = max(0, min(oldest, head) - int(numbers[0])) if len(numbers) else 0
         self._next_tick = head - self._add_ticks(ticks[first:], ports[first:])
         if missing:
-            with contextlib.suppress(Refused):  # the server stops, or no tick comes
+            with contextlib.suppress(Refused):  # the server is stopping, or no tick comes
                 self._save()
 
     def _add_ticks(self, ticks: Records, ports: Records) -> int:
-        """Hand ticks over, settings before their first tick; how many wait for settings that are not here yet."""
+        """Add ticks, each settings message before its first tick. Returns how many ticks wait for settings that have not come yet."""
         begin = 0
         changed = np.flatnonzero(ticks["change"]).tolist()
         for place in [*changed, len(ticks)]:
@@ -208,7 +207,7 @@ class Recorder:
         return f"{self._keys.prefix}/{kind}"
 
     def _write(self, seconds: float) -> None:
-        """Hand over what the pipe takes in this time."""
+        """Write to the pipe what it takes within `seconds`."""
         give_up = time.monotonic() + seconds
         while self._unwritten and _takes_more(self._pipe, give_up - time.monotonic()):
             try:
@@ -216,10 +215,10 @@ class Recorder:
             except BrokenPipeError:
                 raise _EndedEarlyError(self._why_it_ended()) from None
             del self._unwritten[:written]
-        self._hear()
+        self._read_answers()
 
-    def _hear(self) -> None:
-        """Read the lines of the process: how many messages are in the file, or what went wrong."""
+    def _read_answers(self) -> None:
+        """Read the lines that the process wrote: the number of messages in the file, or what went wrong."""
         with contextlib.suppress(BlockingIOError):
             while text := os.read(self._answers, _PIPE_BYTES):
                 *lines, self._line = (self._line + text).split(b"\n")
@@ -227,7 +226,7 @@ class Recorder:
                     if line.isdigit():
                         self.messages = int(line)
                     else:
-                        self._last_words = line.decode(errors="replace")
+                        self._failure = line.decode(errors="replace")
 
     def _finish(self) -> None:
         give_up = time.monotonic() + END_S
@@ -238,18 +237,18 @@ class Recorder:
         try:
             code = self._process.wait(max(0.1, give_up - time.monotonic()))
         except subprocess.TimeoutExpired:
-            raise _EndedEarlyError("its end is still being written") from None
-        self._hear()
+            raise _EndedEarlyError("the file could not be completed in time") from None
+        self._read_answers()
         if code != 0:
             raise _EndedEarlyError(self._why_it_ended())
 
     def _why_it_ended(self) -> str:
         try:
-            code = self._process.wait(_LAST_WORDS_S)
+            code = self._process.wait(_EXIT_S)
         except subprocess.TimeoutExpired:
-            return "its process no longer listens"
-        self._hear()
-        return self._last_words or f"its process ended with code {code}"
+            return "its process has closed the pipe and does not end"
+        self._read_answers()
+        return self._failure or f"its process ended with code {code}"
 
     def _close_pipe(self) -> None:
         assert self._process.stdin is not None

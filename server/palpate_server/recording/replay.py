@@ -71,8 +71,15 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Comparison:
-    """ticks that were repeated, of so many from the first recorded one to the last; with_force: how many of those had a
-    force that is not zero; in so many stretches; the first difference, or None; the names of models that were missing."""
+    """The result of a replay.
+
+    ticks           ticks that were repeated
+    of              ticks from the first recorded one to the last
+    with_force      repeated ticks with a force that is not zero
+    stretches       runs of consecutive ticks that were repeated
+    difference      the first difference, or None
+    missing_models  names of models that the recording needs too
+    """
 
     ticks: int
     of: int
@@ -83,7 +90,7 @@ class Comparison:
 
 
 def read_recording(path: Path) -> Recorded:
-    """Read a recording, also one that breaks off: a full disk, a crash. Raises ReplayError when it is damaged or none."""
+    """Read a recording, complete or cut short by a crash or a full disk. Raises ReplayError if it is damaged or no recording."""
     try:
         with path.open("rb") as stream:
             return _read(path, stream)
@@ -109,7 +116,7 @@ def _read(path: Path, stream: Any) -> Recorded:
         n_tools = len(ticks[0]["tools"]) if ticks else 0
         tools = [tool for message in ticks for tool in message["tools"]]
         recorded.ports = from_objects(tools, PORT_RECORD).reshape(len(ticks), n_tools)
-    except Exception as error:  # a damaged file can hold anything: no cause may get past this
+    except Exception as error:  # a damaged file can raise anything
         raise ReplayError(f"{path}: damaged, or of another version ({_one_line(error)})") from error
     if not len(recorded.ticks) or not recorded.settings:
         raise ReplayError(f"{path}: holds no ticks")
@@ -130,7 +137,7 @@ def _messages(stream: Any, is_complete: bool) -> Iterator[tuple[str, dict[str, A
         except (EndOfFile, struct.error):
             if is_complete:
                 raise
-            return  # it breaks off here: even a length may be cut in two
+            return  # cut short here
         if schema is not None:
             yield schema.name.removeprefix("palpate."), json.loads(message.data)
 
@@ -213,7 +220,9 @@ def _restored(
         )
     memory = shared_memory.make_memory(model.discrete, model.period_s, limits, 1.0)
     if following is not None:
-        coupling = fixed_patch.fade_over(memory.coupling, following.discrete, np.zeros((len(limits), 3)), 1.0)
+        coupling = fixed_patch.cross_fade(
+            memory.coupling, following.discrete, np.zeros((len(limits), 3)), 1.0
+        )
         memory = shared_memory.with_coupling(memory, coupling)
     if before is not None:
         memory = memory._replace(ring=before.ring)
@@ -230,7 +239,7 @@ def _restore(memory: Memory, saved: Saved) -> None:
 
 
 def _feed(memory: Memory, commands: NDArray[np.void], ports: NDArray[np.void], begin: int) -> None:
-    """Put the commands of a tick, (n_tools,), where it finds them."""
+    """Write the commands of a tick, (n_tools,), and the forces from before the stretch, to where the tick reads them."""
     memory.commands.newest[:] = commands
     tick = int(memory.counters["ticks"][0])
     for tool, rendered in enumerate(commands["rendered_tick"].tolist()):

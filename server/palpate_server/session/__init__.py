@@ -1,1 +1,1 @@
-"""The Zenoh session: server, requests, leases, status."""
+"""A running server: admission of commands, requests, leases, status, publishing."""

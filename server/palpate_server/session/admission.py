@@ -1,4 +1,4 @@
-"""Admission of commands: decode, check, refuse with a reason or hand over to the loop. Nothing else does any of this."""
+"""Admission of commands: decode, check, then hand over to the loop or refuse with a reason. All of it is done here."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from palpate_server.realtime import scheduler
 from palpate_server.realtime.records import COMMAND
 from palpate_server.session.state import SessionState
 
-# Fills a records.COMMAND in a fraction of numpy's time.
+# The layout of records.COMMAND: `struct` fills it much faster than numpy does.
 _FIELDS = (COMMAND[name] for name in COMMAND.names or ())
 _COMMAND = struct.Struct(
     "=" + "".join({"i": "q", "f": "d"}[f.base.kind] * (f.itemsize // 8) for f in _FIELDS)
@@ -27,9 +27,10 @@ class Admission:
         self._incoming = state.memory.commands.incoming.view(np.uint8).data
 
     def admit(self, key: str, payload: codec.Payload, arrival_ns: int) -> int:
-        """Carry out a command as a whole, or count why not; the number of ticks that ran with it.
+        """Hand a command to the loop, or count why it is refused. Returns the number of ticks that ran on its arrival.
 
-        key: palpate/SESSION/command/CLIENT. arrival_ns: when it came, on the monotonic clock
+        key         palpate/SESSION/command/CLIENT
+        arrival_ns  on the monotonic clock
         """
         messages = self._state.messages
         try:
@@ -41,7 +42,7 @@ class Admission:
         reason = self._write(command, last_chunk(key), arrival_ns)
         ticks = 0
         if reason is None:
-            # The loop's side checks the numbers: sequence, range, finite.
+            # `arrive` checks the numbers: sequence, finite, range.
             ticks = scheduler.arrive(self._state.image, len(command.position_m))
             reason = scheduler.REFUSALS[-ticks] if ticks < 0 else None
         if reason is not None:
@@ -51,7 +52,7 @@ class Admission:
         return ticks
 
     def _write(self, command: codec.Command, client: str, arrival_ns: int) -> str | None:
-        """Put a command where `arrive` finds it; one of wire.REFUSED when the client may not give it."""
+        """Write a command to where `arrive` reads it. Returns one of palpate_client.wire.REFUSED, or None."""
         state = self._state
         if not state.running:
             return "stopping"
@@ -59,7 +60,7 @@ class Admission:
             tool = state.tool_index.get(name)
             if tool is None:
                 return "unknown_tool"
-            # Read before the holder is: should the tool change hands meanwhile, the number tells.
+            # Read before the holder. If the tool changes hands in between, the loop discards the command by this number.
             lease = state.lease_numbers[tool]
             if state.leases.holders[name] != client:
                 return "not_holder"

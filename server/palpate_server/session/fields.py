@@ -1,4 +1,4 @@
-"""The fields of a request: each is read, or the request is refused by the name of the field and what was expected.
+"""Reads the fields of requests. A refusal names the field and what was expected.
 
 None in an optional field is the same as the field left out.
 """
@@ -44,14 +44,14 @@ def read_request(payload: bytes) -> dict[str, Any]:
     return request
 
 
-def needed(request: dict[str, Any], field: str) -> Any:
+def required(request: dict[str, Any], field: str) -> Any:
     if field not in request:
         raise MalformedMessage("missing_field", f"{field} is missing")
     return request[field]
 
 
 def tools_in(request: dict[str, Any]) -> list[str]:
-    tools = needed(request, "tools")
+    tools = required(request, "tools")
     if not isinstance(tools, list) or not tools or not all(isinstance(name, str) for name in tools):
         raise MalformedMessage("wrong_type", f"tools is {shown(tools)}: expected a list of names")
     if len(set(tools)) < len(tools):
@@ -127,7 +127,7 @@ def device_in(request: dict[str, Any]) -> Device | None:
 
 def limits_in(request: dict[str, Any], known: tuple[str, ...]) -> dict[str, float]:
     """The limits that a request sets, of the known ones."""
-    limits = needed(request, "limits")
+    limits = required(request, "limits")
     if not isinstance(limits, dict):
         raise MalformedMessage("wrong_type", f"limits is {shown(limits)}: expected a map of numbers")
     for field in limits:
@@ -155,5 +155,5 @@ def _optional_number(request: dict[str, Any], field: str) -> float | None:
 
 
 def shown(value: object) -> str:
-    """A client's value as a message repeats it: escaped, and not longer than a line."""
+    """A client's value for a message: escaped, and at most 200 characters."""
     return repr(value)[:200]

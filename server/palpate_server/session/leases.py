@@ -1,4 +1,4 @@
-"""Who holds which tool, and with which settings: a client holds tools alone, until it releases them or vanishes."""
+"""Which client holds which tool, and with which settings. A tool has one holder, until it releases the tool or is gone."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Leases:
         return tuple(name for name, holder in self.holders.items() if holder == client)
 
     def release(self, client: str) -> tuple[str, ...]:
-        """Take every tool away from `client`; the names of those it held."""
+        """Release every tool of `client`. Returns their names."""
         held = self.held_by(client)
         for name in held:
             self.holders[name] = None

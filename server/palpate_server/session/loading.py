@@ -1,4 +1,4 @@
-"""Another model for a running session: checked in a process of its own, then faded over to. No tick waits for it."""
+"""Loads another model into a running server: checks it in a process of its own, then cross-fades. No tick waits for it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from palpate_server.session.state import SessionState
 
 log = logging.getLogger("palpate_server")
 
-FADE_OVER_S = 0.5  # from one model to another
+CROSS_FADE_S = 0.5  # from one model to another
 TOLERABLE_ERROR = 0.1  # of the force in the band; people notice a difference of about 7 % (Jones 1989)
 
 
@@ -32,7 +32,7 @@ class ModelLoader:
         self._folder = folder
 
     def load(self, client: str, file: object) -> dict[str, Any]:
-        """Check a model file, fade over to its model, and let the old one go. Raises Refused."""
+        """Check a model file, cross-fade to its model, and drop the old one. Raises Refused."""
         state = self._state
         if not state.exchanging.acquire(blocking=False):
             raise Refused("busy", "another model is being loaded, or a tool acquired")
@@ -53,14 +53,14 @@ class ModelLoader:
             state.exchanging.release()
 
     def _fade_to(self, model: ReducedModel) -> shared_memory.Memory:
-        """Have the loop fade over to a model that starts settled at the present displacement; the memory to go on with."""
+        """Cross-fade to a model that starts settled at the present displacement. Returns the memory to continue with."""
         state = self._state
-        step = model.period_s / FADE_OVER_S
-        coupling = fixed_patch.fade_over(
+        step = model.period_s / CROSS_FADE_S
+        coupling = fixed_patch.cross_fade(
             state.memory.coupling, model.discrete, state.memory.displacement.copy(), step
         )
         fading = shared_memory.with_coupling(state.memory, coupling)
-        memory = shared_memory.with_coupling(state.memory, fixed_patch.faded_over(coupling))
+        memory = shared_memory.with_coupling(state.memory, fixed_patch.after_cross_fade(coupling))
         state.exchange(fading, state.model, model)
         while coupling.fade[0] < 1.0:
             if state.stopping.wait(model.period_s):
@@ -68,7 +68,7 @@ class ModelLoader:
         return memory
 
     def _end_exchange(self, memory: shared_memory.Memory, model: ReducedModel) -> None:
-        """Once both models have run, the exchange is completed however late ticks are, unless the server stops."""
+        """Drop the old model. Ticks may be late, so this is tried until it succeeds or the server stops."""
         while True:
             try:
                 self._state.exchange(memory, model, None)
@@ -104,7 +104,7 @@ class ModelLoader:
 
 
 def accuracy_warnings(model: ReducedModel) -> list[str]:
-    """What a model's own accuracy report says against serving it; empty when nothing does."""
+    """Warnings that follow from a model's own accuracy report; empty for a good one."""
     error, (low, high) = model.accuracy.error_in_band, model.accuracy.band_hz
     if error <= TOLERABLE_ERROR:
         return []
@@ -115,7 +115,7 @@ def accuracy_warnings(model: ReducedModel) -> list[str]:
 
 
 def warnings_of(state: SessionState, tools: Iterable[str]) -> list[str]:
-    """What whoever renders these tools with the device it named should know of the model that runs."""
+    """Warnings about the model that runs, for the devices with which these tools are rendered."""
     warnings: list[str] = []
     for name in tools:
         settings = state.leases.settings[name]

@@ -1,4 +1,4 @@
-"""What the server sends by itself: a force each tick, the status, and the surface while somebody listens."""
+"""Publishers: the force of each tick, the status, and the surface while somebody subscribes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from palpate_server.session.status import status
 
 log = logging.getLogger("palpate_server")
 
-MAX_UNSENT = 100  # ticks whose forces are still worth sending; what is older is dropped and counted
+MAX_UNSENT = 100  # forces of older ticks are dropped and counted
 
 
 class ForcePublisher:
@@ -39,7 +39,7 @@ class ForcePublisher:
         self._publisher = _publisher(session, state.keys.force, zenoh.Priority.REAL_TIME, express=True)
 
     def send(self) -> None:
-        """Publish the ticks that are not sent yet, unless another thread is at it (which then is told)."""
+        """Publish the ticks that are not sent yet. If another thread is doing that, wake `run` to send the rest."""
         if self._sending.acquire(blocking=False):
             self._send_and_release()
         else:
@@ -47,7 +47,9 @@ class ForcePublisher:
 
     def run(self) -> None:
         """Send the forces of the deadline loop's ticks until the session stops."""
-        threads.raise_priority(threads.COMMAND_PRIORITY)  # that a force fades is told by this thread alone
+        threads.raise_priority(
+            threads.COMMAND_PRIORITY
+        )  # without commands, only this thread sends the fading forces
         while not self._state.stopping.is_set():
             os.eventfd_read(self._wake)
             self._sending.acquire()
@@ -70,7 +72,7 @@ class ForcePublisher:
 
 
 class StatusPublisher:
-    """Sends the status, and lets the black box look whether it has cause to write."""
+    """Sends the status, and has the black box examine the newest ticks."""
 
     def __init__(self, state: SessionState, session: zenoh.Session, black_box: BlackBox | None) -> None:
         self._state = state
@@ -80,7 +82,7 @@ class StatusPublisher:
         self._publisher = _publisher(session, state.keys.status, zenoh.Priority.DATA)
 
     def publish(self) -> None:
-        """Any thread may call this. A mistake in a status does not end the service."""
+        """Send a status now; any thread may call this. An error is logged and not raised."""
         with logged("the status could not be sent"), self._publishing:
             recorder = self._state.recorder
             self._number += 1
@@ -93,7 +95,7 @@ class StatusPublisher:
 
 
 class SurfacePublisher:
-    """Sends the displacement of the surface, at the session's rate, while somebody listens."""
+    """Sends the displacement of the surface, once each surface_period_s, while somebody subscribes."""
 
     def __init__(self, state: SessionState, session: zenoh.Session) -> None:
         self._state = state
@@ -137,7 +139,7 @@ def _publisher(
 
 @contextmanager
 def logged(text: str) -> Iterator[None]:
-    """A mistake in one message must not end the thread that sends all of them: log it and go on."""
+    """Log an exception and continue, so that it does not end the thread that sends all messages."""
     try:
         yield
     except Exception:

@@ -1,4 +1,4 @@
-"""Recordings that clients ask the server to make of itself, one at a time; they belong to no client."""
+"""Recordings that clients start and end, one at a time. A recording belongs to no client: any that may record can end it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _END_TIMEOUT_S = 1.0
 
 
 class Recordings:
-    """Begins and ends recordings in a folder, or refuses to where there is none."""
+    """Starts and ends recordings in a folder; refuses to if there is none."""
 
     def __init__(
         self, state: SessionState, publish_status: Callable[[], None], folder: Path | None, max_bytes: int
@@ -31,9 +31,9 @@ class Recordings:
         self._changing = threading.Lock()  # held while one begins or ends
 
     def record(self, client: str, file: object) -> dict[str, Any]:
-        """Begin a recording in a new file, or end the one that runs when `file` is None. Raises Refused.
+        """Start a recording in a new file, or end the present one if `file` is None. Raises Refused.
 
-        For clients that hold a tool, and for the one whose name is RECORDER: nobody else can fill the folder.
+        Only a client that holds a tool, or whose name is RECORDER, may record: others could fill the folder.
         """
         if self._folder is None:
             raise Refused("no_recordings", "the server was started without a folder for recordings")

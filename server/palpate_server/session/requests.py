@@ -1,4 +1,4 @@
-"""What clients ask for: tools, limits, a reset, another model, a recording. Each is carried out, or refused with a reason."""
+"""Carries out control requests, or refuses them with a reason: acquire, release, limits, reset, load, record."""
 
 from __future__ import annotations
 
@@ -25,16 +25,18 @@ from palpate_server.session.state import SessionState
 log = logging.getLogger("palpate_server")
 
 LEAST_SPEED_M_PER_S = 0.01
-MOST_DAMPING_N_S_PER_M = 100.0  # that passivity control may use without a device that says what it can
+MOST_DAMPING_N_S_PER_M = 100.0  # of passivity control, when no device profile states its own
 
 
 class Requests:
-    """Carries out the actions of wire.ACTIONS; leases change on one thread alone, the one that calls `carry_out`.
+    """Carries out the actions of palpate_client.wire.ACTIONS.
 
-    has_token       asks the session whether a client has its liveliness token
+    One thread calls `on_client` and `carry_out`; only it changes leases. SLOW_ACTIONS run on threads of their own and change none.
+
+    has_token       asks Zenoh whether a client's liveliness token exists
     publish_status  sends a status now
     models          the folder that clients may load from
-    recordings      the folder that clients may have recordings made in, or None
+    recordings      the folder for recordings, of at most max_recordings_bytes; or None
     """
 
     def __init__(
@@ -53,7 +55,7 @@ class Requests:
         self._alive: set[str] = set()  # clients whose liveliness token is known
 
     def on_client(self, client: str, alive: bool) -> None:
-        """A client's liveliness token has come or gone; with it go its tools."""
+        """A client's liveliness token was declared or deleted; when deleted, its tools are released."""
         if alive:
             self._alive.add(client)
             return
@@ -75,9 +77,9 @@ class Requests:
             case "reset":
                 return self._reset(client)
             case "load":
-                return self._loader.load(client, fields.needed(request, "file"))
+                return self._loader.load(client, fields.required(request, "file"))
             case "record":
-                return self.recordings.record(client, fields.needed(request, "file"))
+                return self.recordings.record(client, fields.required(request, "file"))
         raise ValueError(f"{action!r} is none of wire.ACTIONS")
 
     def _acquire(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
@@ -107,16 +109,15 @@ class Requests:
         }
 
     def _check_alive(self, client: str) -> None:
-        # A token may be so new that we have not been told of it.
+        # The token may be so new that on_client was not called yet.
         if client not in self._alive and not self._has_token(client):
             token = self._state.keys.client(client)
             raise Refused("not_alive", f"client {client!r} has no liveliness token at {token}")
 
     def _silence(self, tools: list[str]) -> None:
-        """Let the tools' forces fade to zero, as after a client that has gone, and wait for it.
+        """Wait until the forces of the tools have faded to zero. Nobody holds them meanwhile, so no command is used.
 
-        Until then nobody holds them, so that no command is used. Refused when one does not fade: then they are held as
-        before.
+        Raises Refused if a force does not fade in time; then the tools have the same holders as before.
         """
         state = self._state
         before = {name: state.leases.holders[name] for name in tools}
@@ -135,10 +136,12 @@ class Requests:
         state = self._state
         tool = state.tool_index[name]
         home = frame.point_at_client(state.model.contacts[tool].center_m)
-        settings = state.leases.settings  # true at each moment, also if no tick comes for the second half
+        settings = (
+            state.leases.settings
+        )  # updated after each change, so that they are right even if the second change fails
         state.between_ticks(scheduler.set_frame, tool, np.array(frame.rotation), frame.scale, np.array(home))
         settings[name] = ToolSettings(settings[name].limits, frame, home, device)
-        # The tip is at rest now: it does not matter that the limits come a tick later.
+        # The tip is at rest, so the limits may change a tick later than the frame.
         state.between_ticks(scheduler.set_limits, tool, np.array(limits))
         settings[name] = replace(settings[name], limits=limits)
 
@@ -147,7 +150,7 @@ class Requests:
         wanted = fields.limits_in(request, Limits._fields)
         state.leases.check_holder(client)
         held = state.leases.held_by(client)
-        for name in held:  # for all of them or for none
+        for name in held:  # checked for all tools before any is changed
             self._check_limits(wanted, settings[name].device)
         for name in held:
             limits = settings[name].limits._replace(**wanted)
@@ -156,11 +159,11 @@ class Requests:
         return {"tools": {name: {"limits": settings[name].limits._asdict()} for name in held}}
 
     def _check_limits(self, wanted: dict[str, float], device: Device | None) -> None:
-        """Raises Refused for one that is beyond the server's, or the device's that renders."""
+        """Raises Refused for a limit that is beyond the server's or the device's."""
         ceiling = self._state.limits._replace(max_damping_n_s_per_m=MOST_DAMPING_N_S_PER_M)
         if device is not None:
             ceiling = limits_for(device.profile, ceiling)
-        # Of the server's largest force, not the client's own: one that was allowed before may still stand.
+        # From the server's largest force, because the present force may exceed the client's new limit.
         least_rate = safety.least_force_rate(self._state.limits.max_force_n)
         for field, value in wanted.items():
             most = getattr(ceiling, field)
@@ -186,6 +189,6 @@ class Requests:
         leases = self._state.leases
         released = leases.release(client)
         self._state.forget_commands(released)
-        for name in released:  # the loop keeps the limits and the frame until another holder comes
+        for name in released:  # limits and frame stay in use until the next acquire
             leases.settings[name] = replace(leases.settings[name], device=None)
         return released

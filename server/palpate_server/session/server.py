@@ -1,4 +1,4 @@
-"""The running server: connects the loop, the messages and the leases to a Zenoh session, and ends them again."""
+"""The running server: starts its threads, connects them to a Zenoh session, and stops them."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from palpate_server.session.warm_up import warm_up
 
 log = logging.getLogger("palpate_server")
 
-USUAL_RECORDINGS_BYTES = 10 * 10**9
-USUAL_SURFACE_HZ, FASTEST_SURFACE_HZ = 30.0, 60.0
+DEFAULT_RECORDINGS_BYTES = 10 * 10**9
+DEFAULT_SURFACE_HZ, MAX_SURFACE_HZ = 30.0, 60.0
 _ALIVE_TIMEOUT_S = 1.0
 
 
@@ -42,25 +42,25 @@ class ServerOptions:
     models      the folder that clients may load from
     recordings  the folder that clients may have recordings made in, or None; it may hold max_recordings_bytes
     black_box   the folder for black box files, or None
-    surface_hz  surfaces a second, at most FASTEST_SURFACE_HZ
+    surface_hz  surfaces a second, at most MAX_SURFACE_HZ
     cpu         the processor for the threads that run ticks, or None to leave that to the system
     """
 
     limits: Limits
     models: Path
     recordings: Path | None = None
-    max_recordings_bytes: int = USUAL_RECORDINGS_BYTES
+    max_recordings_bytes: int = DEFAULT_RECORDINGS_BYTES
     black_box: Path | None = None
-    surface_hz: float = USUAL_SURFACE_HZ
+    surface_hz: float = DEFAULT_SURFACE_HZ
     cpu: int | None = None
 
 
 class Server:
     """Serves one model in one Zenoh session, from `start` to `stop`.
 
-    Threads: Zenoh's own one that receives commands (and runs most ticks), the deadline loop (compiled, never needs
-    the GIL), one that sends the forces of its ticks, one for queries and leases, one for the surface; while they are
-    asked for, one to load a model and one of a recorder. The thread that calls `publish_status` sends the status.
+    Threads: one of Zenoh's receives commands and runs most ticks; the deadline loop (compiled, without the GIL) runs the others,
+    and a third thread sends their forces; one answers queries, one sends the surface. The thread that calls `publish_status`
+    sends the status. Loading a model and recording have a thread of their own while they last.
     """
 
     def __init__(
@@ -70,13 +70,13 @@ class Server:
         self.state = state
         self._session = session
         self._cpu = options.cpu
-        black_box = options.black_box and BlackBox(
-            options.black_box, keys.session, list(state.tools), state.memory
-        )
+        black_box = None
+        if options.black_box is not None:
+            black_box = BlackBox(options.black_box, keys.session, state.tools, state.memory)
         self._wake = os.eventfd(0)
         self._admission = Admission(state)
         self._forces = ForcePublisher(state, session, self._wake)
-        self._status = StatusPublisher(state, session, black_box or None)
+        self._status = StatusPublisher(state, session, black_box)
         self._surface = SurfacePublisher(state, session)
         self._requests = Requests(
             state,
@@ -93,7 +93,7 @@ class Server:
             geometry=lambda: codec.encode_geometry(
                 state.model.surface.vertices, state.model.surface.triangles
             ),
-            on_change=self._status.publish,  # so that every setting is told, however soon it changes again
+            on_change=self._status.publish,  # so that a status shows every setting
         )
         self._command_thread_prepared = False
 
@@ -109,10 +109,10 @@ class Server:
             ),
             session.declare_subscriber(keys.command("*"), self._on_command),
         ]
+        self._deadline_thread = threading.Thread(target=self._run_deadlines, name="deadlines", daemon=True)
         self._threads = [
             threading.Thread(target=target, name=name, daemon=True)
             for name, target in (
-                ("deadlines", self._run_deadlines),
                 ("forces", self._forces.run),
                 ("queries", self._queries.run),
                 ("surface", self._surface.run),
@@ -120,18 +120,18 @@ class Server:
         ]
         if notice := threads.lock_memory():
             log.warning("%s", notice)
-        threads.calm_interpreter()
+        threads.tune_interpreter()
         memory = state.memory
         memory.shared[shared_memory.DEADLINE_NS] = time.monotonic_ns() + memory.period_ns[0]
-        for thread in self._threads:
+        for thread in (self._deadline_thread, *self._threads):
             thread.start()
-        # Last, as the sign that everything else answers.
+        # Last: the token says that everything else answers.
         self._declared.append(session.liveliness().declare_token(keys.server))
 
     def stop(self) -> None:
-        """Say so, let the forces fade, stop the loop and take everything back from the session."""
+        """Publish the status `stopping`, let the forces fade, stop the threads, undeclare everything."""
         state = self.state
-        state.running = False  # from here on commands are refused, and forces fade as after silence
+        state.running = False  # commands are refused now, so the forces fade
         self.publish_status()
         time.sleep((safety.HOLD_NS + safety.DECAY_NS) * 1e-9 + 10 * state.model.period_s)
         self.publish_status()
@@ -140,10 +140,10 @@ class Server:
         for declared in reversed(self._declared):
             declared.undeclare()
         self._queries.end()
-        self._threads[0].join()
+        self._deadline_thread.join()
         self._requests.recordings.close()
         os.eventfd_write(self._wake, 1)
-        for thread in self._threads[1:]:
+        for thread in self._threads:
             thread.join()
         os.close(self._wake)
 
@@ -151,11 +151,11 @@ class Server:
         self._status.publish()
 
     def _on_command(self, sample: zenoh.Sample) -> None:
-        """Runs on Zenoh's thread for every command: hand it over, and tick if it is time."""
+        """Zenoh calls this for every command, on the thread that receives them."""
         arrival_ns = time.monotonic_ns()
         if not self._command_thread_prepared:
             self._command_thread_prepared = True
-            self._prepare_thread(threads.COMMAND_PRIORITY)  # what it may not, the loop's thread has said
+            self._prepare_thread(threads.COMMAND_PRIORITY)  # the deadline thread logs what is not allowed
         if self._admission.admit(str(sample.key_expr), sample.payload, arrival_ns):
             self._forces.send()
 
@@ -165,7 +165,7 @@ class Server:
         scheduler.run_at_deadlines(self.state.image, self._wake)
 
     def _prepare_thread(self, priority: int) -> list[str]:
-        """For ticks: real-time priority, and the processor that was asked for; what is not allowed."""
+        """Give the calling thread a real-time priority and the processor of --cpu. Returns what is not allowed."""
         pinned = None if self._cpu is None else threads.pin(self._cpu)
         return [notice for notice in (threads.raise_priority(priority), pinned) if notice]
 

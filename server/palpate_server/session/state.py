@@ -1,4 +1,4 @@
-"""The state of a session that its threads share: model, loop, leases, counters."""
+"""The state that the server's threads share: model, loop, leases, counters."""
 
 from __future__ import annotations
 
@@ -35,15 +35,20 @@ class MessageCounters:
 class SessionState:
     """One model in one session.
 
-    limits                  what no client can exceed
-    tools                   their names, in the model's order
-    tool_index              of a tool's name
-    lease_numbers           of the present hold of each tool, as in the loop's memory
-    running                 False once the server stops: commands and requests are then refused
-    stopping                set when all threads are to end
-    lost_clients            clients whose token went while they held a tool
-    exchanging              held while a model is loaded or a tool acquired: the one would disturb the other
-    model_in_use            held while the surface is computed from the model, and while it is exchanged
+    model          the one that runs; while another is faded in, still the old one
+    limits         what no client can exceed
+    tools          their names, in the model's order
+    tool_index     index of each name in `tools`
+    memory, image  of the loop
+    lease_numbers  number of the present hold of each tool, as in the loop's memory
+    leases         holders and settings of the tools
+    messages       counters of commands
+    running        False once the server stops: commands and requests are then refused
+    stopping       set when all threads have to end
+    lost_clients   number of clients whose token was deleted while they held a tool
+    recorder       the last recording, until a client ends it; or None
+    exchanging     lock: a model is not loaded while a tool is acquired, and vice versa
+    model_in_use   lock: the model is not exchanged while the surface is computed from it
     """
 
     def __init__(self, model: ReducedModel, limits: Limits, keys: Keys, surface_period_s: float) -> None:
@@ -70,7 +75,7 @@ class SessionState:
         self.exchanging = threading.Lock()
         self.model_in_use = threading.Lock()
         self._changing = threading.Lock()  # the loop has one slot for changes
-        self._following: ReducedModel | None = None  # is being faded in
+        self._following: ReducedModel | None = None  # the model that is being faded in
 
     def check_running(self) -> None:
         """Raises Refused once the server stops."""
@@ -78,21 +83,23 @@ class SessionState:
             raise Refused("stopping", "the server is stopping")
 
     def check_alone(self, client: str) -> None:
-        """Raises Refused unless a client holds a tool and no other does: what it asks for would be felt by all."""
+        """Raises Refused unless this client, and no other, holds a tool."""
         for name, holder in self.leases.holders.items():
             if holder not in (None, client):
-                raise Refused("held", f"tool {name!r} is held by client {holder!r}, who would feel it")
+                raise Refused(
+                    "held", f"tool {name!r} is held by client {holder!r}, which the change would affect"
+                )
         self.leases.check_holder(client)
 
     def forget_commands(self, tools: Iterable[str]) -> None:
-        """Let the forces of tools fade from the next tick on."""
+        """End the hold of these tools in the loop: their forces fade from the next tick on."""
         for name in tools:
             tool = self.tool_index[name]
             scheduler.forget_command(self.memory.commands, tool)
             self.lease_numbers[tool] += 1
 
     def between_ticks(self, ask: Callable[..., None], *what: Any) -> None:
-        """Have the loop change something. Raises Refused when no tick comes: nothing is changed."""
+        """Have the next tick make a change: ask(image, *what) requests it. Raises Refused, without a change, if no tick comes."""
         with self._changing:
             self._change(ask, *what)
             self._record_settings()
@@ -100,7 +107,7 @@ class SessionState:
     def exchange(
         self, memory: shared_memory.Memory, model: ReducedModel, following: ReducedModel | None
     ) -> None:
-        """Have the loop go on with another memory, of a model and the one that is faded in; like `between_ticks`."""
+        """Have the loop continue with another memory, of a model and of the one that is faded in; as `between_ticks`."""
         with self._changing:
             self._change(scheduler.exchange, make_image(memory))
             self.memory, self.model, self._following = memory, model, following
@@ -117,6 +124,6 @@ class SessionState:
             time.sleep(self.model.period_s / 4)
 
     def _record_settings(self) -> None:
-        """Tell a recording of the change that was made; before the next one, which saves another state."""
+        """Pass the saved state to the recorder, before the next change saves another one."""
         if self.recorder is not None:
             self.recorder.settings(snapshot.as_message(self.memory, self.model, self._following))

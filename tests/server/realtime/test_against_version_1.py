@@ -59,11 +59,11 @@ class Today:
             case Change.EXCHANGE:
                 running = self.memory.coupling
                 if fixed_patch.is_fading(running):
-                    coupling = fixed_patch.faded_over(running)
+                    coupling = fixed_patch.after_cross_fade(running)
                 else:
                     displacement = self.memory.displacement.copy()
                     np.testing.assert_array_equal(displacement.ravel(), values[: displacement.size])
-                    coupling = fixed_patch.fade_over(running, self.other, displacement, FADE_STEP)
+                    coupling = fixed_patch.cross_fade(running, self.other, displacement, FADE_STEP)
                 self.memory = shared_memory.with_coupling(self.memory, coupling)
                 self.kept.append(self.memory)
                 scheduler.exchange(self.image, make_image(self.memory))

@@ -136,7 +136,7 @@ def test_no_tick_allocates_while_one_model_fades_into_another(
 ) -> None:
     assert ticks.allocations(commanded_ticks, 300) == 0
     other = make_spring_mass_model(2, 7).discrete
-    coupling = fixed_patch.fade_over(ticks.memory.coupling, other, np.zeros((2, 3)), 0.01)
+    coupling = fixed_patch.cross_fade(ticks.memory.coupling, other, np.zeros((2, 3)), 0.01)
     fading = shared_memory.with_coupling(ticks.memory, coupling)
     scheduler.exchange(ticks.image, make_image(fading))
     assert ticks.allocations(commanded_ticks, 50) == 0

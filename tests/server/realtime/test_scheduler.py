@@ -521,7 +521,7 @@ def test_another_model_is_faded_in_where_it_settles(
         command(memory, i, position)
         *_, before, _ = tick(memory)
     other = make_spring_mass_model(1, 7).discrete
-    fading = fixed_patch.fade_over(memory.coupling, other, np.array([position]), 0.01)
+    fading = fixed_patch.cross_fade(memory.coupling, other, np.array([position]), 0.01)
     settled = fading.following.state.copy()
     np.testing.assert_allclose(other.dense_a() @ settled + other.b @ np.array(position), settled, atol=1e-15)
 
@@ -538,7 +538,7 @@ def test_another_model_is_faded_in_where_it_settles(
     expected = before + np.linspace(0, 1, 101)[:, None] * (final - before)
     np.testing.assert_allclose(forces, expected, rtol=0, atol=1e-6 * np.abs(final).max())
 
-    done = shared_memory.with_coupling(memory, fixed_patch.faded_over(fading))
+    done = shared_memory.with_coupling(memory, fixed_patch.after_cross_fade(fading))
     scheduler.exchange(image, make_image(done))
     command(memory, 400, position)
     repeat_tick(image, now_ns(memory))

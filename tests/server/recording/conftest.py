@@ -65,12 +65,12 @@ class Loop:
 
     def load(self, model: ReducedModel) -> None:
         """Fade over to another model within 100 ticks."""
-        coupling = fixed_patch.fade_over(
+        coupling = fixed_patch.cross_fade(
             self.memory.coupling, model.discrete, self.memory.displacement.copy(), 0.01
         )
         self._exchange(coupling, self.model, model)
         self.run(100)
-        self._exchange(fixed_patch.faded_over(coupling), model, None)
+        self._exchange(fixed_patch.after_cross_fade(coupling), model, None)
 
     def _exchange(self, coupling: Any, model: ReducedModel, following: Any) -> None:
         self.memory = shared_memory.with_coupling(self.memory, coupling)

@@ -127,7 +127,7 @@ def test_a_recording_ends_complete_where_its_folder_is_full(loop: Loop, tmp_path
     recording = loop.record(path, 600_000)
     run_until_an_error(loop)
     recording.stop()
-    assert "holds as much as it may" in str(recording.report()["error"])
+    assert "has reached its size limit" in str(recording.report()["error"])
     assert path.stat().st_size <= 600_000
     assert message_count(path) == recording.report()["messages"]
 
