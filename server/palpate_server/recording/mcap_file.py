@@ -2,10 +2,10 @@
 
     python -m palpate_server.recording.mcap_file MAX_BYTES < MESSAGES > OUT.mcap
 
-MESSAGES are msgpack lists, one behind the other: `["message", kind, key, time_ns, payload]` with a msgpack map, and
+MESSAGES are msgpack lists, one after the other: `["message", kind, key, time_ns, payload]` with a msgpack map, and
 `["ticks", key, clock_offset_ns, ticks, ports]` with records.TICK and records.PORT_RECORD as they are in memory. The end of the
-pipe ends the file, also when the server was killed. To stderr the process writes a line each time it has written to the
-file: how many messages are in it; and last, what went wrong.
+pipe completes the file, also when the server was killed. Each time the process has written to the file, it prints the number of
+messages in it to stderr; and at the end, what went wrong.
 """
 
 from __future__ import annotations
@@ -32,8 +32,7 @@ _CHUNK_BYTES = 64 * 1024  # a crash loses no more than this
 _END_BYTES = 64 * 1024  # room for the last chunk and the summary
 _INTEGER, _NUMBER = {"type": "integer"}, {"type": "number"}
 _MAP: dict[str, Any] = {"type": "object", "properties": {}}
-# Foxglove opens a topic when its arrays hold numbers or objects, and its objects say what is in them; it refuses arrays of
-# arrays. So vectors are written as x, y, z.
+# Foxglove refuses arrays of arrays, and objects whose schema does not list their properties. So vectors are x, y, z.
 _POINT = {"type": "object", "properties": dict.fromkeys("xyz", _NUMBER)}
 
 
@@ -71,8 +70,9 @@ class Recording:
     messages: how many are in the file for good, in its first `end` bytes
     """
 
-    def __init__(self, file: IO[bytes]) -> None:
+    def __init__(self, file: IO[bytes], max_bytes: float = math.inf) -> None:
         self._file = file
+        self._max_bytes = max_bytes
         self._writer = Writer(
             file, chunk_size=_CHUNK_BYTES, compression=CompressionType.LZ4, enable_data_crcs=True
         )
@@ -90,6 +90,11 @@ class Recording:
         self.messages = 0
         self.end = file.tell()
 
+    @property
+    def is_full(self) -> bool:
+        """Whether the file must end now, so that it can be completed within `max_bytes`."""
+        return self._file.tell() > self._max_bytes - 2 * _CHUNK_BYTES - _END_BYTES
+
     def add(self, kind: str, key: str, time_ns: int, message: dict[str, Any]) -> None:
         """Write a message. Raises OSError."""
         if key not in self._channels:
@@ -105,11 +110,13 @@ class Recording:
             self.messages, self.end = self._added, self._file.tell()
 
     def add_ticks(self, key: str, clock_offset_ns: int, ticks: bytes, ports: bytes) -> None:
-        """Write the ticks of a part of the ring. Raises OSError."""
+        """Write the ticks of a part of the ring, as far as there is room. Raises OSError."""
         tick_records = np.frombuffer(ticks, TICK)
         tools = as_objects(np.frombuffer(ports, PORT_RECORD))
         n_tools = len(tools) // max(1, len(tick_records))
         for k, tick in enumerate(as_objects(tick_records)):
+            if self.is_full:
+                return
             tick["tools"] = tools[k * n_tools : (k + 1) * n_tools]
             self.add("tick", key, tick["start_ns"] + clock_offset_ns, tick)
 
@@ -128,58 +135,57 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _tell(what: object) -> None:
-    """A line for the server, if it is still there."""
+def _report(what: object) -> None:
+    """Print a line for the server, if it still reads them."""
     with contextlib.suppress(OSError):
         print(what, file=sys.stderr, flush=True)
 
 
-def _write_all(recording: Recording, file: IO[bytes], max_bytes: int) -> str | None:
-    """Write what comes through the pipe until its end; why the recording has ended before, if it has."""
-    told = 0
-    # Unbuffered: a buffered one would wait for a megabyte, which is seconds of ticks.
+def _write_all(recording: Recording) -> str | None:
+    """Write what comes through the pipe until its end. Returns why the recording ended before that, or None."""
+    reported = 0
+    # Unbuffered: a buffered reader would wait for a megabyte, seconds of ticks.
     for what, *parts in msgpack.Unpacker(io.FileIO(sys.stdin.fileno()), raw=False, max_buffer_size=2**28):
         if what == "ticks":
             recording.add_ticks(*parts)
         else:
             kind, key, time_ns, payload = parts
             recording.add(kind, key, time_ns, msgpack.unpackb(payload))
-        if recording.messages > told:
-            told = recording.messages
-            _tell(told)
-        if file.tell() > max_bytes - 2 * _CHUNK_BYTES - _END_BYTES:
+        if recording.messages > reported:
+            reported = recording.messages
+            _report(reported)
+        if recording.is_full:
             return FULL
     return None
 
 
 def main() -> int:
-    # Whoever stops the server stops all of its processes; what the server says to the last is still to be written.
+    # These signals often go to all processes of the server. This one still has to write what the server sends until its end.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    # The server comes first. At 10, a busy machine would leave less than a thousand ticks a second need: some percent.
+    # Lower priority than the server. At 10, a busy machine would leave too little time for a thousand ticks a second.
     os.nice(5)
     max_bytes = int(sys.argv[1])
     limit, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    if (
-        limit == resource.RLIM_INFINITY or limit > max_bytes
-    ):  # for messages that are larger than the room at the end
+    # A bound for messages that are larger than the room that is left.
+    if limit == resource.RLIM_INFINITY or limit > max_bytes:
         resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, hard))
     file = open(sys.stdout.fileno(), "wb", closefd=False)  # noqa: SIM115, it is closed with the process
     error: str | None
-    recording = Recording(file)
+    recording = Recording(file, max_bytes)
     try:
-        error = _write_all(recording, file, max_bytes)
+        error = _write_all(recording)
         recording.finish()
         file.flush()
-        _tell(recording.messages)
+        _report(recording.messages)
     except OSError as failure:
         error = failure.strerror
-        with contextlib.suppress(OSError):  # what is no plain file can't be cut
+        with contextlib.suppress(OSError):  # only a regular file can be truncated
             os.ftruncate(file.fileno(), recording.end)
-        _tell(recording.messages)
+        _report(recording.messages)
     if error is not None:
-        _tell(error)
-        os._exit(1)  # without another try, on the way out, to write what can't be written
+        _report(error)
+        os._exit(1)  # at exit Python would try again to write what can't be written
     return 0
 
 
