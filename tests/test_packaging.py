@@ -51,7 +51,15 @@ def test_a_plain_installation_is_a_client() -> None:
     assert needs("") == {"eclipse-zenoh", "msgpack"}
     assert needs("server") == {"numpy", "numba"}
     assert needs("all") >= needs("build") | needs("plots") | needs("recorder") | needs("metrics")
-    assert {c.extra for c in COMMANDS.values()} <= {"", "server", "build", "recorder", "experiments", "all"}
+    assert {c.extra for c in COMMANDS.values()} <= {
+        "",
+        "server",
+        "build",
+        "recorder",
+        "experiments",
+        "images",
+        "all",
+    }
 
 
 def test_every_requirement_is_pinned() -> None:

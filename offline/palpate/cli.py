@@ -27,6 +27,7 @@ COMMANDS = {
     "demo": Command(_BUILD, "build the liver, serve it, poke it, and draw what was felt", "all", "palpate.commands", "demo"),
     "build": Command(_BUILD, "build a scene into a model file, and say how accurate it is", "build", "palpate.commands", "build"),
     "inspect": Command(_BUILD, "say what a model file holds and how accurate it is", "server", "palpate.commands", "inspect"),
+    "surface": Command(_BUILD, "take the surface of a label of an image, smooth and closed, in m", "images", "palpate.commands", "surface"),
     "repair": Command(_BUILD, "mend a surface file until it bounds one body, and say what was changed", "build", "palpate.commands", "repair"),
     "serve": Command(_SERVE, "run a model file at 1 kHz over Zenoh", "server", "palpate_server.__main__"),
     "check-host": Command(_SERVE, "measure whether this machine holds 1 kHz, and what to change", "server", "palpate_server.diagnostics.check_host"),

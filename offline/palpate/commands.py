@@ -83,6 +83,49 @@ def inspect() -> None:
     print(json.dumps(model.summary(), indent=2) if options.json else accuracy_text(model, options.verbose))
 
 
+def surface() -> None:
+    """Take the surface of one label of an image (NIfTI, NRRD, Inrimage): smooth, closed, with the label's volume, in m.
+    x points to the patient's left, y to the back, z to the head; in an Inrimage along its own axes."""
+    parser = argparse.ArgumentParser(description=surface.__doc__)
+    parser.add_argument("image", type=Path, metavar="IMAGE", help=".nii, .nii.gz, .nrrd, .inr or .inr.gz")
+    parser.add_argument("--label", type=int, required=True, metavar="N")
+    parser.add_argument("--output", "-o", type=Path, metavar="OUT.ply", required=True)
+    parser.add_argument(
+        "--triangles", type=int, default=20_000, metavar="N", help="at most about so many (%(default)s)"
+    )
+    options = parser.parse_args()
+    if not 100 <= options.triangles <= 1_000_000:
+        parser.error(f"--triangles {options.triangles}: expected 100 to 1000000")
+    with stage_reporter() as stages:
+        stages("libraries")
+        with interrupts.ends_at_once():
+            from palpate.files import check_output, write_atomically
+            from palpate.geometry.label_image import read_label_image
+            from palpate.geometry.label_surface import label_surface
+            from palpate.geometry.measures import enclosed_volume
+            from palpate.geometry.ply import ply_bytes
+
+        require_ply(options.output)
+        check_output(options.output, [options.image])
+        stages("image")
+        image = read_label_image(options.image)
+        stages.note(f"{' x '.join(map(str, image.labels.shape))} voxels")
+        stages("surface")
+        found = label_surface(image, options.label, options.triangles)
+    body = found.surface
+    write_atomically(options.output, ply_bytes(body.vertices, body.triangles), [options.image])
+    median, most, largest = found.distance_m * 1e3
+    if found.n_islands:
+        print(f"left out {found.n_islands:,} pieces of the label apart from the largest")
+    if found.cavities_m3:
+        print(f"filled cavities of {found.cavities_m3 * 1e6:.4g} cm³")
+    print(
+        f"label    {found.label_m3 * 1e6:.5g} cm³\nsurface  {enclosed_volume(body) * 1e6:.5g} cm³, "
+        f"{len(body.triangles):,} triangles\noutermost voxels are {median:.2g} mm from it (median), {most:.2g} mm (95 %), "
+        f"{largest:.2g} mm (largest)\nwrote {options.output}, in m"
+    )
+
+
 def repair() -> None:
     """Mend a surface file until it bounds one body, and say what was changed: merged vertices, crumbs, holes, triangles
     that are double, flat, turned or intersecting. The unit stays the file's."""

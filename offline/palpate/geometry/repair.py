@@ -55,6 +55,12 @@ class Repair:
         """Of the file's unit cubed; about that where the surface is open."""
         return enclosed_volume(self.surface)
 
+    def largest_piece(self) -> Repair:
+        """The piece with the largest volume."""
+        n_pieces, piece = igl.facet_components(self.triangles)
+        parts = [Repair(self.vertices, self.triangles[piece == p]) for p in range(n_pieces)]
+        return max(parts, key=lambda part: part.volume)
+
     def keep(self, kept: NDArray[np.bool_]) -> None:
         self.triangles = self.triangles[kept]
 
@@ -73,7 +79,7 @@ def repair_surface(path: Path) -> tuple[bytes, list[str]]:
         raise SurfaceError(f"{path}: {error}") from error
     before = f"{len(mended.triangles):,} triangles that enclose {mended.volume:.6g} of the file's unit cubed"
     try:
-        _mend(mended)
+        mend(mended)
         data = ply_bytes(mended.vertices, mended.triangles)
         from_polygons(read_ply(data), "m", _BY_HAND)
     except (SurfaceError, ReadError, ValueError) as error:
@@ -102,8 +108,8 @@ def _welded(polygons: Polygons) -> Repair:
     return Repair(best.vertices, best.triangles, changes)
 
 
-def _mend(mended: Repair) -> None:
-    """Raises ValueError naming what can't be mended."""
+def mend(mended: Repair) -> None:
+    """Mend all that can be mended. Raises ValueError naming what can't."""
     _drop_duplicates(mended)
     _orient(mended)
     _flip_flat(mended)
