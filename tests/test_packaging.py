@@ -66,7 +66,13 @@ def test_every_requirement_is_pinned() -> None:
     text = (Path(__file__).parents[1] / "constraints.txt").read_text(encoding="utf-8")
     pinned = {line.partition("==")[0].lower().replace("_", "-") for line in text.splitlines()}
     assert (
-        needs("") | needs("all") | needs("dev") | needs("experiments") | needs("surfaces") | needs("pardiso")
+        needs("")
+        | needs("all")
+        | needs("dev")
+        | needs("experiments")
+        | needs("surfaces")
+        | needs("images")
+        | needs("pardiso")
         <= pinned
     )
 
