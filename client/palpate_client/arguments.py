@@ -8,6 +8,8 @@ import math
 from palpate_client import wire
 from palpate_client.connection import Connection
 
+SMALLEST, LARGEST = 1e-9, 1e9
+
 
 def add_connection_options(parser: argparse.ArgumentParser, *, name: bool = True) -> None:
     parser.add_argument(
@@ -47,11 +49,11 @@ def plain_name(text: str) -> str:
 
 
 def positive(text: str) -> float:
-    """A finite number above 0. Raises argparse.ArgumentTypeError."""
+    """A number from SMALLEST to LARGEST: nothing that is computed from it overflows. Raises argparse.ArgumentTypeError."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    if not SMALLEST <= value <= LARGEST:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from {SMALLEST:g} to {LARGEST:g}")
     return value

@@ -20,6 +20,8 @@ from palpate_client.messages import (
     Force,
     Geometry,
     Surface,
+    check_force,
+    check_status,
     decode_geometry,
     read_description,
     read_force,
@@ -57,10 +59,10 @@ class Connection:
         name: str | None = None,
     ) -> None:
         self.keys = wire.Keys(session)
-        self.name = name or f"client-{uuid.uuid4().hex[:12]}"
+        self.name = f"client-{uuid.uuid4().hex[:12]}" if name is None else name
         if not wire.is_name(self.name):
             raise ConfigurationError(f"name is {name!r}: expected 1 to 64 of A-Z a-z 0-9 _ -")
-        self.place = str(zenoh_config or endpoint)
+        self.place = endpoint if zenoh_config is None else str(zenoh_config)
         self.ignored = 0  # messages that could not be read or were of another kind than their key
         self._endpoint, self._zenoh_config = endpoint, zenoh_config
         self._there = threading.Event()
@@ -74,6 +76,8 @@ class Connection:
         self._description: Description | None = None
 
     def __enter__(self) -> Connection:
+        if self._zenoh is not None:
+            raise RuntimeError("the connection is open already: use it in one `with` statement at a time")
         self._zenoh = open_session(self._endpoint, self._zenoh_config)
         try:
             self._join()
@@ -218,7 +222,12 @@ class Connection:
 
     def on_force(self, receive: Callable[[dict[str, Any], int], None]) -> Subscription:
         """Call receive(message, arrival_ns) for the force message of every tick."""
-        return self.on_message(self.keys.force, wire.Kind.FORCE, receive)
+
+        def read(message: dict[str, Any], arrival_ns: int) -> None:
+            check_force(message, len(self.description.tools))
+            receive(message, arrival_ns)
+
+        return self.on_message(self.keys.force, wire.Kind.FORCE, read)
 
     def on_tool_force(self, tool: str, receive: Callable[[Force], None]) -> Subscription:
         """Call receive(force) with one tool's force of every tick. Raises ValueError if there is no such tool."""
@@ -227,7 +236,12 @@ class Connection:
 
     def on_status(self, receive: Callable[[dict[str, Any]], None]) -> Subscription:
         """Call receive(message) for every status, some ten a second."""
-        return self.on_message(self.keys.status, wire.Kind.STATUS, lambda message, at: receive(message))
+
+        def read(message: dict[str, Any], arrival_ns: int) -> None:
+            check_status(message)
+            receive(message)
+
+        return self.on_message(self.keys.status, wire.Kind.STATUS, read)
 
     def next_status(self, timeout_s: float) -> dict[str, Any] | None:
         """The next status that comes, or None when none comes in time. For one thread at a time."""
@@ -304,17 +318,18 @@ def open_session(endpoint: str, zenoh_config: str | Path | None = None) -> zenoh
     try:
         config = _configuration(endpoint, zenoh_config)
     except zenoh.ZError as error:
-        if zenoh_config:
+        if zenoh_config is not None:
             raise ConfigurationError(f"{zenoh_config}: {_words(error)}") from error
         raise ConfigurationError(f"{endpoint!r} is no endpoint, such as {wire.DEFAULT_ENDPOINT}") from error
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise ServerGone(f"nothing answers at {zenoh_config or endpoint}: {_words(error)}") from error
+        place = endpoint if zenoh_config is None else zenoh_config
+        raise ServerGone(f"nothing answers at {place}: {_words(error)}") from error
 
 
 def _configuration(endpoint: str, zenoh_config: str | Path | None) -> zenoh.Config:
-    if zenoh_config:
+    if zenoh_config is not None:
         return zenoh.Config.from_file(zenoh_config)
     config = zenoh.Config()
     for key, value in {

@@ -118,6 +118,43 @@ class Force(NamedTuple):
     arrival_ns: int
 
 
+def check_force(message: Mapping[str, Any], n_tools: int) -> None:
+    """Raises wire.MalformedMessage unless a decoded force message has all its fields, as long as for this many tools."""
+    for name, (width, kind) in wire.FORCE_FIELDS.items():
+        value: Any = message.get(name)
+        if width == wire.PER_TICK:
+            good = type(value) is kind
+        elif width == 1:
+            good = _is_list(value, n_tools, kind)
+        else:
+            good = _is_list(value, n_tools, list) and all(_is_list(row, width, kind) for row in value)
+        if not good:
+            raise wire.MalformedMessage(
+                "wrong_type", f"{name} is {value!r:.100}: expected it as in docs/wire.md"
+            )
+
+
+def _is_list(value: Any, length: int, kind: type) -> bool:
+    return type(value) is list and len(value) == length and all(type(item) is kind for item in value)
+
+
+_STATUS_TYPES: Mapping[str, type] = {
+    **dict.fromkeys(("state",), str),
+    **dict.fromkeys(("number", "server_time_ns", "ticks", "accepted"), int),
+    **dict.fromkeys(("model", "refused", "malformed", "dropped", "tools"), dict),
+}
+
+
+def check_status(message: Mapping[str, Any]) -> None:
+    """Raises wire.MalformedMessage for a decoded status without the fields that clients look at."""
+    for name, kind in _STATUS_TYPES.items():
+        if type(message.get(name)) is not kind:
+            raise wire.MalformedMessage("wrong_type", f"{name} of a status: expected {kind.__name__}")
+    recording = message.get("recording")
+    if not (recording is None or (isinstance(recording, dict) and {"file", "error"} <= recording.keys())):
+        raise wire.MalformedMessage("wrong_type", "recording of a status: expected nil, or a map")
+
+
 def read_force(message: Mapping[str, Any], index: int, arrival_ns: int) -> Force:
     """The force of the tool at `index` in a decoded message."""
     return Force(

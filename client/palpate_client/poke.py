@@ -42,13 +42,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(connection: Connection, options: argparse.Namespace) -> int:
-    if options.record:
+    if options.record is not None:
         from palpate.files import check_output
 
         check_output(Path(options.record))  # better to fail now than after the poke
     tool = Tool(connection, options.tool, silence_s=options.silence_s)
     messages: list[dict[str, Any]] = []
-    if options.record:
+    if options.record is not None:
         connection.on_force(lambda message, arrival_ns: messages.append(message))
     interrupted = False
     lost: str | None = None
@@ -79,7 +79,7 @@ def run(connection: Connection, options: argparse.Namespace) -> int:
         print(f"contract broken: {line}", file=sys.stderr)
     if lost:
         print(f"palpate client: {lost}", file=sys.stderr)
-    unwritten = bool(options.record) and not wrote(options.record, connection.description, messages)
+    unwritten = options.record is not None and not wrote(options.record, connection.description, messages)
     if interrupted:
         return 130
     if lost or summary["contract_broken"]:

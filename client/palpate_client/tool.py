@@ -63,7 +63,9 @@ class Tool:
         self._forces: Subscription = None
 
     def __enter__(self) -> Tool:
-        """Raises Refused, ServerGone or Incompatible."""
+        """Raises Refused, ServerGone or Incompatible, and RuntimeError inside of the tool's own `with` statement."""
+        if self.contract.holding:
+            raise RuntimeError(f"the tool {self.name!r} is held already: use one `with` statement at a time")
         self._acquire()
         self._forces = self._connection.on_tool_force(self.name, self._on_force)
         return self
@@ -73,12 +75,12 @@ class Tool:
             time.sleep(LAST_ANSWERS_S)
         lost = not self.contract.holding
         self.contract.released()
-        self._forces.undeclare()
         try:
+            self._forces.undeclare()
             self._connection.check()
             if not lost:
                 self._connection.control("release")
-        except ServerGone:
+        except Exception:
             if error is None:  # otherwise the first error is more useful
                 raise
 
@@ -86,18 +88,21 @@ class Tool:
         """Send the tip's position, m, and its velocity, m/s, in our frame: once each period.
 
         With a velocity, the server continues the motion for up to 5 ms when a command is late. Raises ServerGone or ToolLost: a device
-        renders zero from then on.
+        renders zero from then on. Raises ValueError for what is not three numbers.
         """
         self._connection.check()
         if not self.contract.holding:
-            reason = self.contract.broken[-1] if self.contract.broken else "it was released"
-            raise ToolLost(f"the tool {self.name!r} is no longer ours: {reason}")
+            reason = (
+                self.contract.broken[-1] if self.contract.broken else "it is held in its `with` statement"
+            )
+            raise ToolLost(f"the tool {self.name!r} is not ours: {reason}")
         if self.silent_s > max(self._silence_s, 0.0 if self.newest else FIRST_FORCE_S):
             raise ServerGone(f"the server is silent: no force for {self.silent_s:.3g} s")
-        velocity = None if velocity_m_per_s is None else {self.name: list(velocity_m_per_s)}
-        self._connection.send(
-            {self.name: list(position_m)}, velocity, self._rendered_tick, self.contract.on_sending
-        )
+        velocity = None
+        if velocity_m_per_s is not None:
+            velocity = {self.name: _vector("velocity_m_per_s", velocity_m_per_s)}
+        position = {self.name: _vector("position_m", position_m)}
+        self._connection.send(position, velocity, self._rendered_tick, self.contract.on_sending)
 
     def take_force(self) -> Vector:
         """The force to render now, N, in our frame: the newest one while it is fresh, otherwise zero.
@@ -160,6 +165,14 @@ class Tool:
         if self.contract.on_force(force):  # a force that breaks the contract is as good as none
             self._since_s = force.arrival_ns * 1e-9
             self.newest = force
+
+
+def _vector(name: str, value: Sequence[float]) -> list[float]:
+    try:
+        x, y, z = map(float, value)  # numpy's numbers too
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is {value!r}: expected three numbers") from None
+    return [x, y, z]
 
 
 class OneSidedContact:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.build import build_model
+from palpate.files import check_output, make_folder
 from palpate.model_file import ModelFileError, ReducedModel, load_model, save_model
 from palpate.plots import Touch, draw_touch, require_matplotlib
 from palpate.progress import Progress
@@ -69,10 +70,13 @@ def run_demo(config_path: Path, out: Path, seconds: float, progress: Progress) -
     Raises what `build_model` raises, and ValueError when server or client fail, with what they said.
     """
     require_matplotlib()
-    out.mkdir(parents=True, exist_ok=True)
-    model_path = out / f"{config_path.stem}.npz"
+    make_folder(out)
+    model_path, recording, picture = (
+        out / name for name in (f"{config_path.stem}.npz", "poke.csv", "demo.png")
+    )
+    for path in (model_path, recording, picture):  # better to fail now than after the work
+        check_output(path)
     model = _built(model_path, config_path, progress)
-    recording = out / "poke.csv"
     progress("server in a second process")
     endpoint = free_endpoint()
     command = [sys.executable, "-m", "palpate_server", str(model_path), "--listen", endpoint]
@@ -83,7 +87,6 @@ def run_demo(config_path: Path, out: Path, seconds: float, progress: Progress) -
         progress.note(f"{client['commands_answered']:,} of {client['commands_sent']:,} commands answered")
     progress("picture")
     touch = read_touch(recording, model)
-    picture = out / "demo.png"
     draw_touch(model, touch, picture)
     difference = touch.force_n - touch.force_full_n
     largest = np.linalg.norm(touch.force_full_n, axis=1).max()

@@ -52,11 +52,24 @@ def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
     folder = path.parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
+    _try_to_write(path, folder)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder for output unless it is there. Raises OSError, in one line, when that can't be, or it can't be written to."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"{printable(path)}: the folder can't be made ({error.strerror})") from error
+    _try_to_write(path, path)
+
+
+def _try_to_write(path: Path, folder: Path) -> None:
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise OSError(f"{shown}: can't write to {printable(folder)} ({error.strerror})") from error
+        raise OSError(f"{printable(path)}: can't write to {printable(folder)} ({error.strerror})") from error
 
 
 def write_atomically(path: Path, data: bytes, inputs: Iterable[Path] = ()) -> None:

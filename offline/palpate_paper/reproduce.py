@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from palpate.files import make_folder
 from palpate.plots import require_matplotlib
 from palpate.progress import NO_PROGRESS, Progress
 from palpate_paper import convergence, discretizations, errors_and_times, frequency_responses, orders
@@ -50,7 +51,7 @@ def reproduce(
         )
     require_matplotlib()
     images = out / "images" / "paper"
-    images.mkdir(parents=True, exist_ok=True)
+    make_folder(images)
     study = Study(quick, progress.note)
     figures, written = [], []
     for number in sorted(set(numbers) or FIGURES):

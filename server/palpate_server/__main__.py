@@ -16,7 +16,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import zenoh
 
-from palpate.files import printable
+from palpate.files import make_folder, printable
 from palpate.model_file import ModelFileError, ReducedModel, load_model
 from palpate_client.arguments import positive
 from palpate_client.wire import DEFAULT_ENDPOINT, DEFAULT_SESSION, Keys
@@ -109,11 +109,9 @@ def _announce(model: ReducedModel, keys: Keys, options: argparse.Namespace) -> N
 def _prepare_folder(option: str, folder: Path) -> None:
     """Make a folder unless it exists. Raises ValueError if that fails or if the folder is not writable."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     except OSError as error:
-        raise ValueError(f"{option} {folder}: can't be made: {error.strerror}") from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise ValueError(f"{option} {folder}: may not be written to")
+        raise ValueError(f"{option} {error}") from error
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -95,6 +95,35 @@ def test_a_tool_is_held_from_entering_to_leaving_and_its_force_points_out_of_the
         assert tool.take_force() == (0.0, 0.0, 0.0)
 
 
+def test_what_is_no_position_is_told_at_once(connection: Connection) -> None:
+    with Tool(connection) as tool:
+        for wrong in ([0.0, 0.0], "abc", [0.0, 0.0, None], 5):
+            with pytest.raises(ValueError, match=r"position_m is .*: expected three numbers"):
+                tool.move(wrong)  # type: ignore[arg-type]
+        tool.move(np.zeros(3, np.float32))  # type: ignore[arg-type]
+        assert any(press_until_a_force(tool))
+
+
+def test_connection_and_tool_are_entered_once_at_a_time(connection: Connection) -> None:
+    with pytest.raises(RuntimeError, match="the connection is open already"), connection:
+        pass
+    tool = Tool(connection)
+    with pytest.raises(ToolLost, match="it is held in its `with` statement"):
+        tool.move(tool.home_m)
+    for _ in range(2):
+        with tool:
+            with pytest.raises(RuntimeError, match="'tip' is held already"), tool:
+                pass
+            assert any(press_until_a_force(tool))
+    assert tool.contract.broken == []
+
+
+def test_an_error_inside_a_tool_is_not_replaced_by_one_of_its_release(connection: Connection) -> None:
+    with pytest.raises(ZeroDivisionError), Tool(connection):
+        connection.close()
+        raise ZeroDivisionError
+
+
 def test_a_frame_turns_positions_and_forces(connection: Connection) -> None:
     """The client's z axis is the outward normal; 1 mm at the client is 2 mm in the model; its origin is the tool's start."""
     described = connection.description.tools[0]
@@ -163,7 +192,7 @@ def test_after_a_server_that_came_back_a_tool_is_acquired_again_but_not_with_ano
                 connection.reconnect(60.0)
 
 
-def test_a_message_of_another_kind_than_its_keys_is_ignored(
+def test_a_message_of_another_kind_than_its_keys_or_without_its_fields_is_ignored(
     serve: Callable[..., Any], connect: Callable[..., Any], wait_for: Callable[..., Any]
 ) -> None:
     served = serve()
@@ -173,9 +202,20 @@ def test_a_message_of_another_kind_than_its_keys_is_ignored(
         Tool(connection) as tool,
     ):
         press_until_a_force(tool)
-        for payload in (b"\xc1", msgpack.packb(observer.statuses[-1])):
-            observer.session.put(observer.key("force"), payload)
-        wait_for(lambda: connection.ignored, "ignored messages", lambda ignored: ignored == 2)
+        force, status = observer.forces[-1], observer.statuses[-1]
+        wrong = [
+            ("force", status),
+            ("force", {"kind": "force"}),
+            ("force", force | {"sequence": []}),
+            ("force", force | {"force_n": [["a", 0.0, 0.0]]}),
+            ("force", force | {"tick": None}),
+            ("status", {"kind": "status"}),
+            ("status", status | {"recording": 7}),
+            ("status", status | {"ticks": "a"}),
+        ]
+        for key, payload in [("force", b"\xc1"), *((key, msgpack.packb(message)) for key, message in wrong)]:
+            observer.session.put(observer.key(key), payload)
+        wait_for(lambda: connection.ignored, "ignored messages", lambda ignored: ignored == len(wrong) + 1)
         assert any(press_until_a_force(tool))
 
 

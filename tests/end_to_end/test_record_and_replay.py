@@ -71,6 +71,29 @@ def test_palpate_record_has_the_server_record_until_a_signal(
     assert code == 0, err
     assert "messages in b.mcap" in out
 
+    recorder = start("-m", "palpate_server.recording.record", "c.mcap", *options, ready="recording")
+    assert recorder.stop(signal.SIGHUP) == 0
+    assert "messages in c.mcap" in recorder.printed()
+
+
+def test_palpate_record_does_not_end_a_recording_of_somebody_else(
+    serve: Callable[..., Any], start: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serve("--recordings", str(tmp_path))
+    options = ("--connect", served.endpoint, "--session", "test")
+    with connect(served.endpoint) as client:
+        assert client.acquire("tip")[0]
+        recorder = start("-m", "palpate_server.recording.record", "a.mcap", *options, ready="recording")
+        client.next_status()
+        client.next_status()
+        assert client.control("record", file=None)[0]
+        assert client.control("record", file="b.mcap")[0]
+        code, _, err = recorder.finish()
+        assert (code, "another client has ended the recording a.mcap" in err) == (2, True)
+        granted, answer = client.control("record", file=None)
+        assert granted
+        assert (answer["recording"]["file"], answer["recording"]["error"]) == ("b.mcap", None)
+
 
 def test_palpate_record_says_why_a_recording_ended_early(
     serve: Callable[..., Any], start: Callable[..., Any], tmp_path: Path

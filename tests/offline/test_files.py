@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate.files import check_output, is_plain_name, printable, write_atomically
+from palpate.files import check_output, is_plain_name, make_folder, printable, write_atomically
 
 
 def make_plain(path: Path) -> None:
@@ -46,6 +46,21 @@ def test_what_is_not_a_plain_file_is_refused_and_stays(
             write(path)
     assert path.lstat().st_mode == before.st_mode
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("make", [make_plain, os.mkfifo, make_link_to("elsewhere")])
+def test_a_folder_for_output_takes_no_other_files_place(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    path = tmp_path / "out"
+    make(path)
+    for folder in (path, path / "images"):
+        with pytest.raises(OSError, match=f"{folder}: the folder can't be made"):
+            make_folder(folder)
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_folder_that_is_there_has_to_be_writable() -> None:
+    with pytest.raises(OSError, match="/proc: can't write to /proc"):
+        make_folder(Path("/proc"))
 
 
 def test_a_device_is_refused() -> None:

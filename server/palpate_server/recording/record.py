@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from palpate.files import printable
-from palpate_client import ClientError
+from palpate_client import ClientError, Refused
 from palpate_client.arguments import add_connection_options, connection_for, plain_name, positive
 from palpate_client.connection import Connection
 from palpate_client.wire import RECORDER
@@ -40,8 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--duration-s", type=positive, metavar="S", help="(default: until Ctrl-C)")
     options = parser.parse_args(arguments)
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # the server would go on recording
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as under nohup
+            signal.signal(number, lambda *_: stop.set())
     try:
         with connection_for(options) as connection:
             report = record(connection, options.file, stop, options.duration_s or math.inf)
@@ -59,16 +60,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def record(connection: Connection, file: str, stop: threading.Event, duration_s: float) -> dict[str, Any]:
     """Record until `stop` is set, the time is over, or the recording ends; the server's report. Raises ClientError."""
+    begun, broke_off, replaced = threading.Event(), threading.Event(), threading.Event()
+
+    def hear(status: dict[str, Any]) -> None:
+        recording = status["recording"]
+        if recording is None or recording["file"] != file:
+            if begun.is_set():  # before, a status may be older than the recording
+                replaced.set()
+            return
+        begun.set()
+        if recording["error"] is not None:
+            broke_off.set()
+
+    connection.on_status(hear)
     connection.control("record", file=file)
     print(
         printable(f"recording {connection.keys.prefix} to {file} at the server; Ctrl-C ends it"), flush=True
     )
     end_s = time.monotonic() + duration_s
-    while not stop.wait(_POLL_S) and time.monotonic() < end_s:
+    while not (broke_off.is_set() or replaced.is_set() or stop.wait(_POLL_S)) and time.monotonic() < end_s:
         connection.check()
-        recording = connection.status and connection.status["recording"]
-        if recording and recording["file"] == file and recording["error"] is not None:
-            break
+    if replaced.is_set():
+        raise Refused("not_recording", f"another client has ended the recording {file}")
     report: dict[str, Any] = connection.control("record", file=None)["recording"]
     return report
 

@@ -91,6 +91,8 @@ class Comparison:
 
 def read_recording(path: Path) -> Recorded:
     """Read a recording, complete or cut short by a crash or a full disk. Raises ReplayError if it is damaged or no recording."""
+    if path.exists() and not path.is_file():  # to open a pipe would wait for its other end
+        raise ReplayError(f"{path}: not a plain file")
     try:
         with path.open("rb") as stream:
             return _read(path, stream)

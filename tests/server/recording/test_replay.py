@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -204,6 +205,13 @@ def test_no_damage_is_taken_for_a_difference_and_each_gives_one_line(
         else:  # what was damaged is nothing that a replay reads
             assert code == 0, (attempt, place, out, err)
     assert refused > 80
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.mcap"
+    os.mkfifo(pipe)
+    with pytest.raises(replay.ReplayError, match=r"pipe\.mcap: not a plain file"):
+        replay.read_recording(pipe)
 
 
 def test_help_tells_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
