@@ -41,7 +41,7 @@ def center_displacement(study: Study) -> Figure:
     ):
         modes = elastic_modes(body)
         shapes = body.basis.values(modes.parameters)
-        load = spot_load.modal_load(shapes, pressure)
+        load = spot_load.modal_load(shapes, body.supports.free, pressure)
         curve = _at(center_of(cloud)[0], modes.squared_frequencies, shapes, load, len(times))
         curves[f"{name}, {cloud.n_nodes} nodes"] = curve
     exact = curves["exact"]

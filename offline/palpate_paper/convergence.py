@@ -160,7 +160,7 @@ def membrane_errors(
         for method, body in _meshfree(cloud):
             modes = elastic_modes(body)
             shapes = body.basis.values(modes.parameters)
-            load = spot_load.modal_load(shapes, pressure)
+            load = spot_load.modal_load(shapes, body.supports.free, pressure)
             add(method, deflections(modes.squared_frequencies, shapes, load, prony))
         elements = finite_element_fields.membrane_modes(cloud.points, cloud.on_edge, middle, spot_radius)
         add("linear finite elements", deflections(*elements, prony))

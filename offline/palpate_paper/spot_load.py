@@ -86,7 +86,9 @@ def modal_history(mu: Modal, prony: PronySeries, step_s: float, n_steps: int) ->
     return q
 
 
-def modal_load(shapes: Modal, pressure_over_density: Array) -> Modal:
-    """(n_modes,): the load's share of every mode, for shapes (n_nodes, n_modes) of a discrete model, symmetric or not."""
-    free = np.flatnonzero(np.any(shapes != 0, axis=1))
+def modal_load(shapes: Modal, free: NDArray[np.int64], pressure_over_density: Array) -> Modal:
+    """(n_modes,): the load's share of every mode, for shapes (n_nodes, n_modes) of a discrete model, symmetric or not.
+
+    free  (n_modes,), the nodes that move
+    """
     return np.linalg.solve(shapes[free], pressure_over_density[free].astype(shapes.dtype))

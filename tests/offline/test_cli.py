@@ -48,7 +48,7 @@ def test_build_shows_its_stages_and_a_verdict_in_plain_words_and_writes_one_file
         "reduction",
         "force while moving",
         "force at rest",
-        "verdict: good",
+        "verdict: fair",
         "wrote",
     ):
         assert words in printed
@@ -157,7 +157,7 @@ def test_a_mistake_ends_in_one_plain_message_and_exit_code_2(
         ("radius_m = 0.011", "radius_m = 10.0", "contact 'tip': radius_m = 10 holds"),
         ("point_m = [0.03, 0.03, 0.03]", "point_m = [0.03, 0.03, 0.0]", "contact 'tip' and a fixed region share node"),
         ("normal = [0.0, 0.0, -1.0]", "normal = [0.0, 0.0, 0.0]", "fixed[0].normal = [0.0, 0.0, 0.0]"),
-        ("counts = [7, 7, 4]\njitter = 0.1", "counts = [30, 30, 30]", "GiB"),
+        ("counts = [7, 7, 4]\njitter = 0.1", 'counts = [30, 30, 30]\n[discretization]\nmethod = "collocation"\n[reduction]\nmethod = "tbr"\norder = 20', "GiB"),
     ],
 )  # fmt: skip
 def test_a_scene_that_makes_no_sense_is_refused_by_the_name_of_its_part(
@@ -205,7 +205,7 @@ class TestInterrupt:
 
     START = "from palpate.__main__ import main; print('ready', flush=True); main()"
 
-    @pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.3, 0.75, 1.5, 3.0])
+    @pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.3, 0.75, 1.5])
     def test_some_time_after_the_start(
         self, tmp_path: Path, slab_scene: Callable[..., str], delay_s: float
     ) -> None:
