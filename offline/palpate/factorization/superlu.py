@@ -20,12 +20,18 @@ class SuperLU:
 
     def __init__(self, upper: csr_array) -> None:
         full = csc_array(upper + triu(upper, 1).T)
-        self._lu = splu(
-            full,
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        try:
+            self._lu = splu(
+                full,
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+        except MemoryError as error:  # also where the factor has more entries than its 32-bit indices count
+            raise MemoryError(
+                f"SuperLU has not enough memory for a matrix of {full.shape[0]:,} rows: "
+                "use a coarser cloud, or install palpate[pardiso], which needs about half"
+            ) from error
         self.nnz = int(self._lu.nnz)
 
     @cached_property
