@@ -108,6 +108,7 @@ class Recorder:
         self._answers = self._process.stderr.fileno()
         for descriptor in (self._pipe, self._answers):
             os.set_blocking(descriptor, False)
+        self._collecting = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -151,16 +152,20 @@ class Recorder:
             self._process.poll()
 
     def collect(self) -> None:
-        """Copy the new ticks from the ring, each settings message before its first tick. The thread calls this every PERIOD_S."""
-        while not self._queued.empty():
-            kind, tick, payload = self._queued.get_nowait()
-            if kind == "settings":
-                self._settings[tick] = payload
-                if self._next_tick is None:
-                    self._next_tick = tick
-            else:
-                self._add(kind, payload)
-        self._take_ticks()
+        """Copy the new ticks from the ring, each settings message before its first tick.
+
+        The recorder's thread calls this every PERIOD_S; any other thread may, too.
+        """
+        with self._collecting:
+            while not self._queued.empty():
+                kind, tick, payload = self._queued.get_nowait()
+                if kind == "settings":
+                    self._settings[tick] = payload
+                    if self._next_tick is None:
+                        self._next_tick = tick
+                else:
+                    self._add(kind, payload)
+            self._take_ticks()
 
     def _take_ticks(self) -> None:
         if self._next_tick is None:
