@@ -12,7 +12,14 @@ from scipy.spatial import cKDTree
 
 from palpate.geometry.cloud import NodeCloud, TriangleSurface
 from palpate.geometry.measures import enclosed_volume, triangle_normals
-from palpate.geometry.sampling import Samples, closest_point, depth_inside, sample_elements, sample_inside
+from palpate.geometry.sampling import (
+    InnerSamples,
+    Samples,
+    closest_point,
+    depth_inside,
+    sample_elements,
+    sample_inside,
+)
 from palpate.geometry.sharp_edges import sharp_edges
 from palpate.geometry.spacing import Refinement, SpacingField
 from palpate.geometry.tributary import nearest_node, tributary_cells, tributary_measures
@@ -57,7 +64,7 @@ def fill_surface(
     boundary = _boundary_nodes(surface, field, gaps, rng)
 
     samples = sample_inside(surface, field, _PLACING)
-    room = depth_inside(samples.points, surface) > 0.5 * samples.spacing
+    room = _deeper_than(0.5 * samples.spacing, samples, surface)
     points = _place(boundary, samples, room, 3, lambda p: p, field, gaps, rng)
     n_boundary = len(boundary)
     if len(points) == n_boundary:
@@ -82,6 +89,14 @@ def fill_surface(
         surface=surface,
         gaps=gaps,
     )
+
+
+def _deeper_than(depth_m: Array, samples: InnerSamples, surface: TriangleSurface) -> NDArray[np.bool_]:
+    """(n_samples,): whether each sample is deeper inside than its depth (n_samples,)."""
+    deeper = samples.least_depth > depth_m
+    unsure = np.flatnonzero(~deeper)
+    deeper[unsure] = depth_inside(samples.points[unsure], surface) > depth_m[unsure]
+    return deeper
 
 
 def _check_spacing(surface: TriangleSurface, spacing_m: float, refinements: tuple[Refinement, ...]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -12,8 +13,13 @@ from palpate.geometry.visibility import Sight
 
 Array = NDArray[np.float64]
 
+Indices = NDArray[np.intp]
+
 _CANDIDATES = 16
 """Next to a gap, so many of the nearest nodes are asked whether they are in sight."""
+
+_NEIGHBORS = 24
+"""Of each node, so many of the nearest others are known where a sample's nearest node is looked for."""
 
 
 def nearest_node(nodes: Array, samples: Array, sight: Sight | None = None) -> NDArray[np.intp]:
@@ -24,13 +30,79 @@ def nearest_node(nodes: Array, samples: Array, sight: Sight | None = None) -> ND
     the same sample, one of them stays without.
     """
     tree = cKDTree(nodes)
-    owner = np.asarray(tree.query(samples, workers=-1)[1])
+    owner = _nearest(nodes, tree, samples)
     if sight is not None and len(sight.beside):
         owner[sight.beside] = _nearest_in_sight(nodes, tree, owner[sight.beside], samples, sight)
     empty = np.flatnonzero(np.bincount(owner, minlength=len(nodes)) == 0)
     if len(empty):
         _, own_sample = cKDTree(samples).query(nodes[empty])
         owner[own_sample] = empty
+    return owner
+
+
+def _nearest(nodes: Array, tree: cKDTree, samples: Array) -> Indices:
+    """(n_samples,): the nearest node, the first of equally near ones.
+
+    Ten times as fast as asking the tree for every sample: the walk of `_walk` begins at the node nearest to the middle
+    of a grid's cell. The tree is asked where a walk is lost, which happens in clouds whose spacing changes abruptly.
+    """
+    low, extent = nodes.min(axis=0), np.ptp(nodes, axis=0)
+    size = float(np.cbrt(np.prod(np.maximum(extent, extent.max() / 1000)) / len(nodes))) or 1.0
+    shape = (extent / size).astype(np.int64) + 1
+    middles = low + (np.indices(tuple(shape)).reshape(3, -1).T + 0.5) * size
+    starts = np.asarray(tree.query(middles)[1])
+    k = min(_NEIGHBORS + 1, len(nodes))
+    distances, neighbors = (np.reshape(a, (-1, k))[:, 1:] for a in tree.query(nodes, k=k))
+    complete = k == len(nodes)
+    owner = _walk(samples, nodes, neighbors, distances, complete, starts, low, size, shape)
+    lost = np.flatnonzero(owner < 0)
+    if len(lost):
+        owner[lost] = tree.query(samples[lost])[1]
+    return owner
+
+
+@njit(cache=True)
+def _walk(
+    samples: Array,
+    nodes: Array,
+    neighbors: Indices,
+    distances: Array,
+    complete: bool,
+    starts: Indices,
+    low: Array,
+    size: float,
+    shape: NDArray[np.int64],
+) -> Indices:
+    """(n_samples,): the node nearest to each sample, by steps from node to neighbor; -1 where it can't be told.
+
+    neighbors, distances (n_nodes, k): of each node the nearest others in ascending distance, m; complete if these are all.
+    A node nearer to a sample than the one at distance d is within 2 d of that one. So the walk has arrived where none of
+    the neighbors within 2 d is nearer, and is lost where the known neighbors end before.
+    """
+    owner = np.empty(len(samples), np.intp)
+    for i in range(len(samples)):
+        x, y, z = samples[i, 0], samples[i, 1], samples[i, 2]
+        cell = 0
+        for axis in range(3):
+            along = int((samples[i, axis] - low[axis]) / size)
+            cell = cell * shape[axis] + min(max(along, 0), shape[axis] - 1)
+        at = starts[cell]
+        nearest = (x - nodes[at, 0]) ** 2 + (y - nodes[at, 1]) ** 2 + (z - nodes[at, 2]) ** 2
+        walking = True
+        while walking:
+            walking = False
+            known = complete
+            reach = 2 * np.sqrt(nearest) * (1 + 1e-9)
+            for k in range(neighbors.shape[1]):
+                if distances[at, k] > reach:
+                    known = True
+                    break
+                j = neighbors[at, k]
+                square = (x - nodes[j, 0]) ** 2 + (y - nodes[j, 1]) ** 2 + (z - nodes[j, 2]) ** 2
+                if square < nearest or (square == nearest and j < at):
+                    at, nearest, walking = j, square, True
+                    break
+        owner[i] = at if known else -1
     return owner
 
 
@@ -73,14 +145,24 @@ def tributary_cells(
     """The Voronoi cells of the nodes within the sampled body. Arguments and errors as `tributary_measures`."""
     owner = nearest_node(nodes, samples, sight)
     shares = _shares(owner, nodes, weights)
-    moment = [np.bincount(owner, weights * x, minlength=len(nodes)) for x in samples.T]
-    centroids = np.column_stack(moment) / shares[:, None]
-    away = samples - centroids[owner]
-    moments = np.empty((len(nodes), 3, 3))
-    for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)):
-        second = np.bincount(owner, weights * away[:, a] * away[:, b], minlength=len(nodes)) / shares
-        moments[:, a, b] = moments[:, b, a] = second
-    return Cells(shares * (total / shares.sum()), centroids, moments)
+    first, second = _moments(owner, nodes, samples, weights)
+    away = first / shares[:, None]
+    moments = second / shares[:, None, None] - away[:, :, None] * away[:, None, :]
+    return Cells(shares * (total / shares.sum()), nodes + away, moments)
+
+
+@njit(cache=True)
+def _moments(owner: Indices, nodes: Array, samples: Array, weights: Array) -> tuple[Array, Array]:
+    """(n_nodes, 3) and (n_nodes, 3, 3): the sums of w x and w x x^T over a node's samples, x from the node."""
+    first, second = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3, 3))
+    for i in range(len(samples)):
+        o = owner[i]
+        for a in range(3):
+            moment = weights[i] * (samples[i, a] - nodes[o, a])
+            first[o, a] += moment
+            for b in range(3):
+                second[o, a, b] += moment * (samples[i, b] - nodes[o, b])
+    return first, second
 
 
 def tributary_measures(

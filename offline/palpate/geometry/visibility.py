@@ -75,8 +75,10 @@ class Gaps:
     def _beside(self, points: Array) -> tuple[Mask, Array]:
         if not len(self.places):
             return np.zeros(len(points), dtype=bool), np.zeros(len(points))
-        distance, place = self._tree.query(points, workers=-1)
-        spacing = self.spacing[place]
+        farthest = 1.5 * float(self.spacing.max())
+        distance, place = self._tree.query(points, distance_upper_bound=farthest * (1 + 1e-9))
+        # Beyond the bound the distance is infinite and the place is none.
+        spacing = self.spacing[np.minimum(place, len(self.places) - 1)]
         return distance <= 1.5 * spacing, spacing
 
     @cached_property
