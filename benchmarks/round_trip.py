@@ -25,7 +25,7 @@ from palpate_server.diagnostics.round_trips import (
     through_a_model,
 )
 from palpate_server.diagnostics.sample_model import spring_mass_model
-from palpate_server.realtime.records import PORT_RECORD
+from palpate_server.realtime.records import PORT_RECORD, TICK
 
 
 def main() -> None:
@@ -41,7 +41,11 @@ def main() -> None:
         model = load_model(path)
         tool = model.contacts[0].name
         n = len(model.contacts)
-        force_bytes = len(codec.ForceEncoder(n).encode(0, 0, codec.as_words(np.zeros(n, PORT_RECORD))))
+        force_bytes = len(
+            codec.ForceEncoder(n).encode(
+                codec.as_words(np.zeros(1, TICK))[0], codec.as_words(np.zeros(n, PORT_RECORD))
+            )
+        )
         command_bytes = len(encode_command(tool, 10**6, 10**15, (0.1, 0.2, 0.3)))
         print(
             f"order {model.order}, {n} tools; "

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from device_trace import Trace
 from palpate.model_file import ReducedModel
+from palpate_server.coupling.models import make_running
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import Limits
@@ -59,7 +60,9 @@ def press(
     """
     inwards = -np.array(model.contacts[0].normal)
     limits = Limits(1e6, 1e12, 1e6, 1e3, max_damping_n_s_per_m)
-    memory = shared_memory.make_memory(model.discrete, model.period_s, [limits] * len(model.contacts), 1.0)
+    memory = shared_memory.make_memory(
+        make_running(model), model.period_s, [limits] * len(model.contacts), 1.0
+    )
     image = make_image(memory)
     incoming = memory.commands.incoming[0]
     propagators = handle.propagators(np.diff(trace.device_ns) * 1e-9).tolist()

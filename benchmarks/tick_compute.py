@@ -28,6 +28,7 @@ from numba.core.runtime import rtsys
 
 from palpate_server import codec
 from palpate_server.bodies import state_space
+from palpate_server.coupling.models import make_running
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
@@ -131,16 +132,16 @@ def row(order: int, contacts: int, runs: int) -> None:
     run_reads(1, matrices)
 
     limits = Limits(10.0, 2000.0, 1.0, 0.1, 4.0)
-    memory = shared_memory.make_memory(system, model.period_s, [limits] * contacts, 1 / 30)
+    memory = shared_memory.make_memory(make_running(model), model.period_s, [limits] * contacts, 1 / 30)
     ticks_args = (memory.commands.incoming, make_image(memory), time.monotonic_ns(), int(memory.period_ns[0]))
     run_ticks(1, *ticks_args)
     entry, ticks = (allocations(lambda n=n: run_ticks(n, *ticks_args)) for n in (0, STEPS))
     encoder = codec.ForceEncoder(contacts)
-    ports = codec.as_words(memory.ring.ports)[0]
+    tick_words, ports = (codec.as_words(part)[0] for part in (memory.ring.ticks, memory.ring.ports))
 
     def encode() -> None:
-        for k in range(STEPS):
-            encoder.encode(k, k, ports)
+        for _ in range(STEPS):
+            encoder.encode(tick_words, ports)
 
     reading, stepping, blas, tick, encoding = best_in_turns(
         runs,

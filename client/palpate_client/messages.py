@@ -97,12 +97,32 @@ def read_description(message: Mapping[str, Any]) -> Description:
     )
 
 
+class Touch(NamedTuple):
+    """How one tool touches the tissue, and the energies since the tissue was at rest, J; all as in docs/wire.md.
+
+    normal: of the contact, outward, of length 1, in the client's frame; zero without a contact.
+    """
+
+    normal: Sequence[float]
+    penetration_m: float
+    slip_m: float
+    n_contact_points: int
+    work_j: float
+    stored_j: float
+    dissipated_j: float
+    withheld_j: float
+
+
+NO_TOUCH = Touch((0.0, 0.0, 0.0), 0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0)
+
+
 class Force(NamedTuple):
     """One tool's part of a force message; the fields are those of docs/wire.md.
 
     position_m: where the tip was applied, m, in the client's frame.
     force_n: what the device renders, N, in the client's frame: the force of the tissue on the tool.
     arrival_ns: when the message came, on our monotonic clock.
+    touch: how the tool touches the tissue.
     """
 
     tick: int
@@ -116,6 +136,7 @@ class Force(NamedTuple):
     force_scale: float
     energy_j: float
     arrival_ns: int
+    touch: Touch = NO_TOUCH
 
 
 def check_force(message: Mapping[str, Any], n_tools: int) -> None:
@@ -169,6 +190,7 @@ def read_force(message: Mapping[str, Any], index: int, arrival_ns: int) -> Force
         message["force_scale"][index],
         message["energy_j"][index],
         arrival_ns,
+        Touch(*(message[name][index] for name in Touch._fields)),
     )
 
 

@@ -69,6 +69,9 @@ class Flags(IntFlag):
     CAUGHT_UP = 1024  # the tick was missed and made up for, together with a later one
     PASSIVITY_LIMITED = 2048  # the port had given out energy; the force is damped to take it back
     JUMPED = 4096  # the command is farther away than a tip can move in `hold_s`: the force fades on the way
+    IN_CONTACT = 8192  # the tip touches the tissue
+    SLIDING = 16384  # the tip slides along the tissue
+    ATTACHED = 32768  # the tip holds the tissue, which follows it in every direction
 
 
 # Fields of a force message: how many numbers each has (PER_TICK: one for the tick; else for every tool), and their type.
@@ -84,6 +87,16 @@ FORCE_FIELDS: Mapping[str, tuple[int, type[int] | type[float]]] = {
     "force_n": (3, float),
     "force_scale": (1, float),
     "energy_j": (1, float),
+    "normal": (3, float),
+    "penetration_m": (1, float),
+    "slip_m": (1, float),
+    "n_contact_points": (1, int),
+    "work_j": (1, float),
+    "stored_j": (1, float),
+    "dissipated_j": (1, float),
+    "withheld_j": (1, float),
+    "tissue_stored_j": (PER_TICK, float),
+    "tissue_dissipated_j": (PER_TICK, float),
 }
 
 # Why a payload can't be read. The status counts them for commands; a query gets them as its refusal.

@@ -17,10 +17,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import zenoh
 
 from palpate.files import make_folder, printable
-from palpate.model_file import ModelFileError, ReducedModel, load_model
+from palpate.model_file import ModelFileError, load_model
 from palpate_client.arguments import positive
 from palpate_client.wire import DEFAULT_ENDPOINT, DEFAULT_SESSION, Keys
 from palpate_server.arguments import index, need
+from palpate_server.coupling import models
+from palpate_server.coupling.models import Model
 from palpate_server.realtime.safety import Limits, least_force_rate
 from palpate_server.session import log_limit, transport
 from palpate_server.session.loading import accuracy_warnings
@@ -100,8 +102,8 @@ def _server_options(options: argparse.Namespace) -> ServerOptions:
     )
 
 
-def _announce(model: ReducedModel, keys: Keys, options: argparse.Namespace) -> None:
-    tools = ", ".join(contact.name for contact in model.contacts)
+def _announce(model: Model, keys: Keys, options: argparse.Namespace) -> None:
+    tools = ", ".join(tool.name for tool in models.tools_of(model))
     text = f"serving {model.name} (order {model.order}, tools: {tools}) as {keys.prefix}"
     print(printable(f"{text} on {options.zenoh_config or options.listen}; Ctrl-C stops"), flush=True)
 

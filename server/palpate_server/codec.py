@@ -6,6 +6,7 @@ Keys, kinds, reasons and bounds are those of `palpate_client.wire`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import msgpack
@@ -24,7 +25,7 @@ from palpate_client.wire import (
     unpack,
 )
 from palpate_server.realtime.compiled import compiled
-from palpate_server.realtime.records import PORT_RECORD
+from palpate_server.realtime.records import PORT_RECORD, TICK
 
 Vector = tuple[float, float, float]
 STILL: Vector = (0.0, 0.0, 0.0)
@@ -41,7 +42,7 @@ class Payload(Protocol):
 class Command(NamedTuple):
     """Where a client's tool tips are: position and velocity of named tools, in the client's frame.
 
-    velocity_m_per_s has exactly the tools of position_m; rendered_tick is the tick whose force the device was rendering
+    velocity_m_per_s has exactly the tools of position_m, attach none that it has not; rendered_tick is the tick whose force the device was rendering
     until now, -1 when the client does not tell.
     """
 
@@ -50,6 +51,7 @@ class Command(NamedTuple):
     position_m: Mapping[str, Vector]
     velocity_m_per_s: Mapping[str, Vector]
     rendered_tick: int = -1
+    attach: Mapping[str, bool] = MappingProxyType({})
 
 
 def decode_command(payload: bytes) -> Command:
@@ -73,9 +75,22 @@ def decode_command(payload: bytes) -> Command:
     _check_integer("sequence", sequence)
     _check_integer("client_time_ns", client_time_ns)
     if (rendered_tick := message.get("rendered_tick")) is None:
-        return Command(sequence, client_time_ns, position, velocity)
-    _check_integer("rendered_tick", rendered_tick)
-    return Command(sequence, client_time_ns, position, velocity, rendered_tick)
+        rendered_tick = -1
+    else:
+        _check_integer("rendered_tick", rendered_tick)
+    if (attach := message.get("attach")) is None:
+        return Command(sequence, client_time_ns, position, velocity, rendered_tick)
+    _check_attach(attach, position)
+    return Command(sequence, client_time_ns, position, velocity, rendered_tick, attach)
+
+
+def _check_attach(attach: object, position: Mapping[str, Vector]) -> None:
+    if type(attach) is not dict or not all(type(value) is bool for value in attach.values()):
+        raise MalformedMessage(
+            "wrong_type", f"attach is {attach!r:.100}: expected a map of tools to true or false"
+        )
+    if not attach.keys() <= position.keys():
+        raise MalformedMessage("wrong_shape", "attach names tools that position_m does not")
 
 
 def _check_integer(name: str, value: object) -> None:
@@ -100,7 +115,12 @@ def _vectors(field: str, value: object) -> dict[str, Vector]:
     return vectors
 
 
-_WORD = {name: offset // 8 for name, (_, offset, *_) in (PORT_RECORD.fields or {}).items()}
+def _words(record: np.dtype[np.void]) -> dict[str, int]:
+    return {name: offset // 8 for name, (_, offset, *_) in (record.fields or {}).items()}
+
+
+_TICK_WORDS = _words(TICK) | {"server_time_ns": _words(TICK)["start_ns"]}
+_PORT_WORDS = _words(PORT_RECORD)
 _MARKERS = {int: b"\xd3", float: b"\xcb"}  # msgpack's for int64 and float64
 _ONE, _THREE = 9, 28  # bytes of a number, of an array of three
 
@@ -121,39 +141,39 @@ class ForceEncoder:
             one = _MARKERS[number_type] + bytes(8)
             if numbers != PER_TICK:
                 template += packer.pack_array_header(n_tools)
-            word = 0 if numbers == PER_TICK else _WORD[name]
+            word = _TICK_WORDS[name] if numbers == PER_TICK else _PORT_WORDS[name]
             self._layout[i] = len(template), numbers, word
             item = packer.pack_array_header(3) + 3 * one if numbers == 3 else one
             template += item * (1 if numbers == PER_TICK else n_tools)
         self._message = np.frombuffer(bytes(template), np.uint8).copy()
 
-    def encode(self, tick: int, server_time_ns: int, ports: NDArray[np.int64]) -> bytes:
-        """One tick's answer; ports (n_tools, words), of `as_words`, in the order of the describe reply."""
-        _fill_force(self._message, self._layout, tick, server_time_ns, ports)
+    def encode(self, tick: NDArray[np.int64], ports: NDArray[np.int64]) -> bytes:
+        """One tick's answer; tick (words,) and ports (n_tools, words), of `as_words`, in the order of the describe reply."""
+        _fill_force(self._message, self._layout, tick, ports)
         return self._message.tobytes()
 
 
-def as_words(ports: NDArray[np.void]) -> NDArray[np.int64]:
-    """Port records (..., n_tools) PORT_RECORD as words of 8 bytes, (..., n_tools, words), in the same memory."""
-    return ports.view(np.int64).reshape(*ports.shape, -1)
+def as_words(records: NDArray[np.void]) -> NDArray[np.int64]:
+    """Records (...,), TICK or PORT_RECORD, as words of 8 bytes, (..., words), in the same memory."""
+    return records.view(np.int64).reshape(*records.shape, -1)
 
 
 @compiled
 def _fill_force(
     message: NDArray[np.uint8],
     layout: NDArray[np.int64],
-    tick: int,
-    server_time_ns: int,
+    tick: NDArray[np.int64],
     ports: NDArray[np.int64],
 ) -> None:
     """Write a tick's numbers, big-endian, behind their markers in the message.
 
-    layout (fields, 3): a field's place in the message, how many numbers it has a tool, its first word in a port's record
+    layout (fields, 3): a field's place in the message, how many numbers it has a tool, its first word in the record
     """
-    _write(message, layout[0, 0], tick)
-    _write(message, layout[1, 0], server_time_ns)
-    for field in range(2, layout.shape[0]):
+    for field in range(layout.shape[0]):
         place, numbers, word = layout[field]
+        if numbers == PER_TICK:
+            _write(message, place, tick[word])
+            continue
         for tool in range(ports.shape[0]):
             if numbers == 3:
                 for axis in range(3):

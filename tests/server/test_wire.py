@@ -32,6 +32,7 @@ from palpate_client.wire import (
     MAX_MESSAGE_BYTES,
     MAX_REQUEST_BYTES,
     NOT_GRANTED,
+    PER_TICK,
     REFUSED,
     SCHEMA_VERSION,
     Flags,
@@ -44,7 +45,7 @@ from palpate_client.wire import (
 )
 from palpate_server import codec
 from palpate_server.errors import Refused
-from palpate_server.realtime.records import PORT_RECORD
+from palpate_server.realtime.records import PORT_RECORD, TICK
 from palpate_server.realtime.safety import Limits
 from palpate_server.recording.recorder import Recorder
 from palpate_server.session.fields import read_request
@@ -59,7 +60,11 @@ GOOD: dict[str, Any] = {
     "client_time_ns": 5,
     "position_m": {"tip": [0.0, 1e-3, -2]},
 }
-MOVING: dict[str, Any] = GOOD | {"velocity_m_per_s": {"tip": [1.0, 2, 3]}, "rendered_tick": 7}
+MOVING: dict[str, Any] = GOOD | {
+    "velocity_m_per_s": {"tip": [1.0, 2, 3]},
+    "rendered_tick": 7,
+    "attach": {"tip": True},
+}
 
 json_like = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary(),
@@ -87,11 +92,11 @@ def test_a_command_is_read_as_it_was_meant() -> None:
         3, 5, {"tip": (0.0, 1e-3, -2.0)}, {"tip": codec.STILL}
     )
     assert codec.decode_command(pack(MOVING)) == codec.Command(
-        3, 5, {"tip": (0.0, 1e-3, -2.0)}, {"tip": (1.0, 2.0, 3.0)}, 7
+        3, 5, {"tip": (0.0, 1e-3, -2.0)}, {"tip": (1.0, 2.0, 3.0)}, 7, {"tip": True}
     )
 
 
-@pytest.mark.parametrize("field", ["velocity_m_per_s", "rendered_tick"])
+@pytest.mark.parametrize("field", ["velocity_m_per_s", "rendered_tick", "attach"])
 def test_nil_in_an_optional_field_is_the_field_left_out(field: str) -> None:
     left_out, nil = pack(without(MOVING, field)), pack(MOVING | {field: None})
     assert codec.decode_command(nil) == codec.decode_command(left_out)
@@ -136,6 +141,9 @@ def test_the_order_of_fields_does_not_matter() -> None:
         (bytes(10_000_000), "too_large"),
         (pack(without(GOOD, "kind")), "wrong_kind"),
         (pack(GOOD | {"kind": "force"}), "wrong_kind"),
+        (pack(GOOD | {"attach": {"tip": 1}}), "wrong_type"),
+        (pack(GOOD | {"attach": ["tip"]}), "wrong_type"),
+        (pack(GOOD | {"attach": {"tap": True}}), "wrong_shape"),
         (pack(GOOD | {"kind": ["command"]}), "wrong_kind"),
         (pack(without(GOOD, "sequence")), "missing_field"),
         (pack(without(GOOD, "position_m")), "missing_field"),
@@ -231,7 +239,7 @@ def test_a_client_of_version_1_is_told_what_to_do() -> None:
 
 def test_a_message_of_another_kind_is_not_taken_for_one() -> None:
     encoder = codec.ForceEncoder(1)
-    force = encoder.encode(0, 0, no_ticks(1))
+    force = encoder.encode(*no_ticks(1))
     assert unpack(force, Kind.FORCE)["tick"] == 0
     with pytest.raises(MalformedMessage) as caught:
         unpack(force, Kind.STATUS)
@@ -244,7 +252,7 @@ def test_names_that_could_change_a_key_expression_are_refused(name: object) -> N
 
 
 def no_ticks(n: int) -> Any:
-    return codec.as_words(np.zeros(n, PORT_RECORD))
+    return codec.as_words(np.zeros(1, TICK))[0], codec.as_words(np.zeros(n, PORT_RECORD))
 
 
 @settings(deadline=None)
@@ -257,14 +265,22 @@ def no_ticks(n: int) -> Any:
 def test_forces_carry_every_number_unchanged(n_tools: int, tick: int, number: float, integer: int) -> None:
     random = np.random.default_rng(tick % 1000)
     ports = np.zeros(n_tools, PORT_RECORD)
-    for name in ("sequence", "client_time_ns", "input_age_ns", "flags"):
-        ports[name] = random.integers(-1, 2**40, n_tools)
-    for name in ("position_m", "force_n", "force_scale", "energy_j"):
-        ports[name] = random.normal(size=ports[name].shape)
+    of_tools = {name: kind for name, (numbers, kind) in FORCE_FIELDS.items() if numbers != PER_TICK}
+    for name, kind in of_tools.items():
+        shape = ports[name].shape
+        ports[name] = random.integers(-1, 2**40, shape) if kind is int else random.normal(size=shape)
     ports["client_time_ns"][-1], ports["force_n"][-1, 1] = integer, number
-    payload = codec.ForceEncoder(n_tools).encode(tick, 10, codec.as_words(ports))
-    expected = {name: ports[name].tolist() for name in list(FORCE_FIELDS)[2:]}
-    assert msgpack.unpackb(payload) == {"kind": "force", "tick": tick, "server_time_ns": 10} | expected
+    ticks = np.zeros(1, TICK)
+    ticks["tick"], ticks["start_ns"], ticks["tissue_stored_j"], ticks["tissue_dissipated_j"] = (
+        tick,
+        10,
+        0.5,
+        number,
+    )
+    payload = codec.ForceEncoder(n_tools).encode(codec.as_words(ticks)[0], codec.as_words(ports))
+    of_tick = {"tick": tick, "server_time_ns": 10, "tissue_stored_j": 0.5, "tissue_dissipated_j": number}
+    expected = {name: ports[name].tolist() for name in of_tools} | of_tick
+    assert msgpack.unpackb(payload) == {"kind": "force"} | expected
 
 
 def test_surface_displacements_are_little_endian_float32() -> None:
@@ -419,7 +435,7 @@ def test_the_page_lists_the_keys_of_the_code() -> None:
 
 
 def test_the_page_lists_exactly_the_fields_of_a_force() -> None:
-    message = msgpack.unpackb(codec.ForceEncoder(1).encode(0, 0, no_ticks(1)))
+    message = msgpack.unpackb(codec.ForceEncoder(1).encode(*no_ticks(1)))
     assert [row[0].strip("`") for row in _table("Force")] == list(message)
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.model_file import AccuracyReport, Contact, PoleResidueSystem, ReducedModel, StateSpace, Surface
+from palpate_server.coupling import fixed_patch
+from palpate_server.coupling.running import Running
 
 Floats = NDArray[np.float64]
 
@@ -59,6 +61,13 @@ def spring_mass_model(n_contacts: int = 1, n_modes: int = 4, period_s: float = 1
         config_sha256="",
         built_with="palpate_server.diagnostics.sample_model",
     )
+
+
+def patches_of(system: StateSpace, displacement: Floats | None = None) -> Running:
+    """A running patch model of these matrices alone, at rest or settled at (n_tools, 3), m; its normals along z."""
+    n = len(system.c) // 3
+    normals = np.tile([0.0, 0.0, 1.0], (n, 1))
+    return Running(fixed_patch.make(system, normals, np.ones(n, np.int64), displacement))
 
 
 def _state_spaces(

@@ -51,6 +51,7 @@ def move(port: Record, settings: Record, command: Record, age: int, period_ns: i
     for j in range(3):
         # Energy passes the port with the motion of the device, even if the tip follows more slowly.
         port.step_m[j] = port.position_m[j] - port.device_m[j] if moved else 0.0
+        port.before_m[j] = port.applied_m[j]
         if moved:
             port.device_m[j] = port.position_m[j]
     flags |= safety.follow(
@@ -103,6 +104,7 @@ def render(port: Record, settings: Record, model_force: Floats, period_s: float)
         flags |= _FAULT
     for j in range(3):
         port.force_n[j] = force[j]
+        port.rendered_work_j -= force[j] * (port.applied_m[j] - port.before_m[j])
     return flags
 
 

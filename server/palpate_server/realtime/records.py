@@ -37,6 +37,7 @@ COMMAND = np.dtype(
         ("rendered_tick", _INTEGER),  # whose force the device was rendering until then; -1: not told
         ("position_m", *_VECTOR),
         ("velocity_m_per_s", *_VECTOR),
+        ("attach", _INTEGER),  # 1: the tip is to hold the tissue under it
     ]
 )
 """A command for one tool."""
@@ -51,9 +52,27 @@ SETTINGS = np.dtype(
         ("rotation", _FLOAT, (3, 3)),  # the frame, as in `frames`
         ("scale", _FLOAT),
         ("home_m", *_VECTOR),
+        ("radius_m", _FLOAT),  # of the sphere that touches a surface model, as are
+        ("friction", _FLOAT),
+        ("stiffness_n_per_m", _FLOAT),  # of the spring between device and sphere, in the model
     ]
 )
-"""Limits and frame of a port."""
+"""Limits and frame of a port, and what its tool is."""
+
+REACTION = np.dtype(
+    [
+        ("normal", *_VECTOR),  # of the contact, outward, of length 1; zero without one
+        ("penetration_m", _FLOAT),  # of the tip into the undeformed tissue
+        ("slip_m", _FLOAT),  # of the tip along the tissue in this tick
+        ("n_contact_points", _INTEGER),
+        ("flags", _INTEGER),  # wire.Flags: IN_CONTACT, SLIDING, ATTACHED
+        # J, since the tissue was at rest:
+        ("work_j", _FLOAT),  # that the tool did
+        ("stored_j", _FLOAT),  # in the spring between device and tip
+        ("dissipated_j", _FLOAT),  # in the contact
+    ]
+)
+"""How a tool touches the tissue, and its energies; vectors in the model's frame."""
 
 PORT = np.dtype(
     [
@@ -70,6 +89,8 @@ PORT = np.dtype(
         ("rendered_force_n", *_VECTOR),  # the force that the device rendered while it moved by `step_m`
         ("force_scale", _FLOAT),  # share of the force that is given out
         ("energy_j", _FLOAT),  # that the port took in
+        ("before_m", *_VECTOR),  # where the tip was in the tick before
+        ("rendered_work_j", _FLOAT),  # that the tip did against `force_n`, since the tissue was at rest
     ]
 )
 """The state of a port between two ticks, beside its newest command."""
@@ -95,6 +116,8 @@ TICK = np.dtype(
         ("compute_ns", _INTEGER),
         ("flags", _INTEGER),
         ("change", _INTEGER),  # a Change that was made right before the tick
+        ("tissue_stored_j", _FLOAT),
+        ("tissue_dissipated_j", _FLOAT),  # since the tissue was at rest
     ]
 )
 """What one tick was, for all ports."""
@@ -105,6 +128,7 @@ PORT_RECORD = np.dtype(
         ("client_time_ns", _INTEGER),
         ("input_age_ns", _INTEGER),
         ("rendered_tick", _INTEGER),
+        ("attach", _INTEGER),
         ("target_m", *_VECTOR),
         ("velocity_m_per_s", *_VECTOR),
         ("rendered_force_n", *_VECTOR),
@@ -113,6 +137,14 @@ PORT_RECORD = np.dtype(
         ("force_n", *_VECTOR),
         ("force_scale", _FLOAT),
         ("energy_j", _FLOAT),
+        ("normal", *_VECTOR),  # from here on as REACTION, in the client's frame
+        ("penetration_m", _FLOAT),
+        ("slip_m", _FLOAT),
+        ("n_contact_points", _INTEGER),
+        ("work_j", _FLOAT),
+        ("stored_j", _FLOAT),
+        ("dissipated_j", _FLOAT),
+        ("withheld_j", _FLOAT),  # of work_j, what was not felt: by fading, limits and passivity control
     ]
 )
 """What one port did in one tick: the command as it was used, and what came of it."""

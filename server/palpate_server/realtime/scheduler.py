@@ -19,7 +19,7 @@ from typing import Any
 from numba import int32, types, uint64
 
 from palpate_client.wire import MAX_POSITION_M, MAX_VELOCITY_M_PER_S
-from palpate_server import coupling as couplings
+from palpate_server.coupling import cross_fade
 from palpate_server.realtime import safety
 from palpate_server.realtime.atomics import (
     MAX_READS,
@@ -49,7 +49,7 @@ from palpate_server.realtime.shared_memory import (
     Integers,
     Memory,
 )
-from palpate_server.realtime.tick import count, put_to_rest, run_tick
+from palpate_server.realtime.tick import count, put_tissue_to_rest, put_to_rest, run_tick
 
 MAX_CATCH_UP = 20
 _RETRY_NS = 20_000  # how long the deadline loop sleeps while the other thread runs the tick
@@ -220,7 +220,7 @@ def take_up_change(image: Image) -> None:
             m.ports[tool].device_m[j] = m.settings[tool].home_m[j]
         put_to_rest(m, tool)
     elif kind == Change.RESET:
-        couplings.put_to_rest(m.coupling)
+        put_tissue_to_rest(m)
         for i in range(m.ports.shape[0]):
             m.ports[i].force_scale = 0.0
             put_to_rest(m, i)
@@ -239,7 +239,7 @@ def _save(m: Memory) -> None:
         m.saved.used[i] = m.used[i]
         m.saved.settings[i] = m.settings[i]
         m.saved.ports[i] = m.ports[i]
-    couplings.save(m.coupling, m.saved.state)
+    cross_fade.save(m.coupling, m.saved.state)
 
 
 @compiled
@@ -327,7 +327,7 @@ def records_written(shared: Integers) -> int:
 
 @compiled
 def read_snapshot(image: Image, state: Floats, displacement: Floats) -> int:
-    """Copy the last snapshot into `state` (order,) of the body and `displacement` (n_tools, 3), m; its tick, or -1."""
+    """Copy the last snapshot into `state` (shown_size,) and `displacement` (n_tools, 3), m; its tick, or -1."""
     m = view(image)
     for _ in range(MAX_READS):
         version = begin_read(m.snapshot.versions, 0)

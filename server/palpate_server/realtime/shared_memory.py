@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.model_file import StateSpace
-from palpate_server.coupling import fixed_patch
-from palpate_server.coupling.fixed_patch import FixedPatch
+from palpate_server.coupling import cross_fade, running
+from palpate_server.coupling.cross_fade import Coupling
+from palpate_server.coupling.running import Running
 from palpate_server.realtime import native_image
 from palpate_server.realtime.native_image import Image
 from palpate_server.realtime.records import (
@@ -19,6 +19,7 @@ from palpate_server.realtime.records import (
     COUNTERS,
     PORT,
     PORT_RECORD,
+    REACTION,
     RECORDS,
     SETTINGS,
     TICK,
@@ -28,7 +29,6 @@ from palpate_server.realtime.safety import Limits
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Records = NDArray[np.void]
-Coupling = FixedPatch
 
 HISTOGRAM_BINS = 10_000  # one microsecond each; the last one counts all longer durations
 
@@ -82,7 +82,7 @@ class Saved(NamedTuple):
 class Snapshot(NamedTuple):
     """State and displacement of one tick, for the surface, under a sequence lock.
 
-    versions (1,); every (1,), ticks between two snapshots; tick (1,); state, of the coupling; displacement (n, 3), m
+    versions (1,); every (1,), ticks between two snapshots; tick (1,); state (shown_size,), of the coupling; displacement (n, 3), m
     """
 
     versions: Integers
@@ -110,7 +110,8 @@ class Memory(NamedTuple):
     commands      the newest of each tool
     read, used    (n,) COMMAND: a read that may be torn, and the commands of this tick
     ports         (n,) PORT
-    displacement, force  (n, 3), m and N, in the model's frame: from the ports to the coupling and back
+    displacement, wanted  (n, 3), m, in the model's frame; (n,), LIFTED, TOUCHING or GRABBING: from the ports to the coupling
+    force, reactions, ledger  (n, 3), N; (n,) REACTION; (2,), J, stored and dissipated in the tissue: and back
     """
 
     period_ns: Integers
@@ -124,7 +125,10 @@ class Memory(NamedTuple):
     used: Records
     ports: Records
     displacement: Floats
+    wanted: Integers
     force: Floats
+    reactions: Records
+    ledger: Floats
     coupling: Coupling
     ring: Ring
     changes: Changes
@@ -133,17 +137,18 @@ class Memory(NamedTuple):
 
 
 def make_memory(
-    system: StateSpace,
+    model: Running,
     period_s: float,
     limits: Sequence[Limits],
     snapshot_period_s: float,
     homes: Sequence[Sequence[float]] | None = None,
 ) -> Memory:
-    """Memory for a patch model at rest, with no command yet, whose first deadline is a period from now.
+    """Memory for a model that runs, with no command yet, whose first deadline is a period from now.
 
     homes (n_tools, 3), m: where the tips are, at their tools' starts; the origin when left out
     """
-    coupling, n = fixed_patch.make(system), len(limits)
+    n = len(limits)
+    coupling = cross_fade.make(model, n)
     period_ns = round(period_s * 1e9)
     shared = np.zeros(5, np.int64)
     shared[DEADLINE_NS] = time.monotonic_ns() + period_ns
@@ -169,10 +174,13 @@ def make_memory(
         used=_no_commands(n),
         ports=ports,
         displacement=np.zeros((n, 3)),
+        wanted=np.zeros(n, np.int64),
         force=np.zeros((n, 3)),
+        reactions=np.zeros(n, REACTION),
+        ledger=np.zeros(2),
         coupling=coupling,
         ring=Ring(np.zeros(RECORDS, TICK), np.zeros((RECORDS, n), PORT_RECORD)),
-        changes=Changes(np.zeros(1, np.int64), np.zeros(1, SETTINGS), native_image.empty_image(_NAME)),
+        changes=Changes(np.zeros(1, np.int64), np.zeros(1, SETTINGS), native_image.empty_image(_IMAGE)),
         saved=_saved(coupling),
         snapshot=_snapshot(coupling, max(1, round(snapshot_period_s / period_s))),
     )
@@ -221,18 +229,10 @@ def _snapshot(coupling: Coupling, every: int) -> Snapshot:
         np.zeros(1, np.int64),
         np.array([every]),
         np.full(1, -1),
-        np.zeros(coupling.state_size()),
+        np.zeros(coupling.shown_size()),
         np.zeros((coupling.n_tools, 3)),
     )
 
 
-_NAME = "fixed_patch"  # of images of a memory with this coupling
-native_image.register(
-    _NAME,
-    make_memory(
-        StateSpace(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((3, 0)), np.zeros((3, 3))),
-        1e-3,
-        [Limits(1.0, 1.0, 1.0, 1.0, 1.0)],
-        1.0,
-    ),
-)
+_IMAGE = "memory"
+native_image.register(_IMAGE, make_memory(running.empty(), 1e-3, [Limits(1.0, 1.0, 1.0, 1.0, 1.0)], 1.0))

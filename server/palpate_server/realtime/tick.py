@@ -6,7 +6,8 @@ Nothing here allocates, waits or raises.
 from __future__ import annotations
 
 from palpate_client.wire import Flags
-from palpate_server import coupling as couplings
+from palpate_server.coupling import cross_fade
+from palpate_server.coupling.running import GRABBING, LIFTED, TOUCHING
 from palpate_server.realtime import frames, port, safety
 from palpate_server.realtime.atomics import (
     MAX_READS,
@@ -30,9 +31,7 @@ from palpate_server.realtime.shared_memory import (
 
 _BIN_NS = 1_000  # of a histogram
 
-# The tissue is at rest when, for _REST_TICKS in a row, every tip is at its start and no force is above _REST_FORCE_N. Its state
-# is then set to zero. Otherwise it would decay into denormal numbers, which are slow.
-_REST_FORCE_N = 1e-9
+# When the tissue was still for so long, its state is set to zero: it would decay into denormal numbers, which are slow.
 _REST_TICKS = 500
 
 _FAULT = int(Flags.FAULT)
@@ -52,12 +51,12 @@ def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
         _move(m, i, start, record.flags)
     if tick % m.snapshot.every[0] == 0:
         _write_snapshot(m, tick)
-    couplings.advance(m.coupling, m.displacement, m.force)
+    cross_fade.advance(m.coupling, m.displacement, m.wanted, m.force, m.reactions, m.ledger)
     fault = 0
     if not safety.all_finite(m.force.reshape(m.force.size)):
         fault = _FAULT
         counters.faults += 1
-        couplings.put_to_rest(m.coupling)
+        put_tissue_to_rest(m)
         m.force[:] = 0.0
         for i in range(m.ports.shape[0]):
             m.ports[i].force_scale = 0.0
@@ -66,6 +65,8 @@ def run_tick(m: Memory, deadline: int, start: int, missed: bool) -> None:
     _settle(m)
 
     record.tick = tick
+    record.tissue_stored_j = m.ledger[0]
+    record.tissue_dissipated_j = m.ledger[1]
     record.start_ns = start
     record.deadline_ns = deadline
     counters.ticks = tick + 1
@@ -102,11 +103,18 @@ def _move(m: Memory, i: int, start: int, tick_flags: int) -> None:
         count(m, INPUT_AGE, age)
     flags = tick_flags | port.move(one, settings, command, age, m.period_ns[0])
     frames.to_model(settings.rotation, settings.scale, settings.home_m, one.applied_m, m.displacement[i])
+    if (
+        one.force_scale == 0.0
+    ):  # it may be on its way through the tissue, to its start or to a client that jumped
+        m.wanted[i] = LIFTED
+    else:
+        m.wanted[i] = GRABBING if command.attach else TOUCHING
     record = m.ring.ports[m.counters[0].ticks % RECORDS, i]
     record.sequence = command.sequence
     record.client_time_ns = command.client_time_ns if age >= 0 else -1
     record.input_age_ns = age
     record.rendered_tick = command.rendered_tick
+    record.attach = command.attach
     record.flags = flags
     for j in range(3):
         record.target_m[j] = command.position_m[j]
@@ -124,7 +132,8 @@ def _render(m: Memory, i: int, tick: int, fault: int) -> None:
     if flags & _FAULT:
         m.counters[0].faults += 1
     record = m.ring.ports[tick % RECORDS, i]
-    port.finish(one, flags | fault | record.flags)
+    reaction = m.reactions[i]
+    port.finish(one, flags | fault | record.flags | reaction.flags)
     record.flags = one.flags
     for j in range(3):
         record.rendered_force_n[j] = one.rendered_force_n[j]
@@ -132,6 +141,15 @@ def _render(m: Memory, i: int, tick: int, fault: int) -> None:
         record.force_n[j] = one.force_n[j]
     record.force_scale = one.force_scale
     record.energy_j = one.energy_j
+    scale = m.settings[i].scale
+    frames.to_device(m.settings[i].rotation, 1.0, reaction.normal, record.normal)
+    record.penetration_m = reaction.penetration_m / scale
+    record.slip_m = reaction.slip_m / scale
+    record.n_contact_points = reaction.n_contact_points
+    record.work_j = reaction.work_j
+    record.stored_j = reaction.stored_j
+    record.dissipated_j = reaction.dissipated_j
+    record.withheld_j = reaction.work_j - one.rendered_work_j
 
 
 @compiled
@@ -148,13 +166,10 @@ def rendered_before(tick: int, rendered_tick: int) -> int:
 def _settle(m: Memory) -> None:
     """Zero the state exactly after _REST_TICKS quiet ticks."""
     counters = m.counters[0]
-    still = not couplings.is_fading(m.coupling)
-    for i in range(m.force.shape[0]):
-        for j in range(3):
-            still = still and m.displacement[i, j] == 0.0 and abs(m.force[i, j]) <= _REST_FORCE_N
+    still = cross_fade.is_still(m.coupling, m.displacement, m.force)
     counters.quiet_ticks = counters.quiet_ticks + 1 if still else 0
     if counters.quiet_ticks == _REST_TICKS:
-        couplings.put_to_rest(m.coupling)
+        put_tissue_to_rest(m)
 
 
 @compiled
@@ -183,7 +198,7 @@ def _read_commands(m: Memory) -> None:
 def _write_snapshot(m: Memory, tick: int) -> None:
     begin_write(m.snapshot.versions, 0)
     m.snapshot.tick[0] = tick
-    couplings.save(m.coupling, m.snapshot.state)
+    cross_fade.save_shown(m.coupling, m.snapshot.state)
     for i in range(m.displacement.shape[0]):
         for j in range(3):
             m.snapshot.displacement[i, j] = m.displacement[i, j]
@@ -196,6 +211,20 @@ def count(m: Memory, histogram: int, duration_ns: int) -> None:
     duration = max(duration_ns, 0)
     m.longest_ns[histogram] = max(m.longest_ns[histogram], duration)
     m.histograms[histogram, min(duration // _BIN_NS, HISTOGRAM_BINS - 1)] += 1
+
+
+@compiled
+def put_tissue_to_rest(m: Memory) -> None:
+    """Zero the state of the model, and all energies that are counted since then."""
+    cross_fade.put_to_rest(m.coupling)
+    m.ledger[:] = 0.0
+    for i in range(m.ports.shape[0]):
+        m.ports[i].rendered_work_j = 0.0
+        reaction = m.reactions[i]
+        reaction.normal[:] = 0.0
+        reaction.penetration_m = reaction.slip_m = 0.0
+        reaction.n_contact_points = reaction.flags = 0
+        reaction.work_j = reaction.stored_j = reaction.dissipated_j = 0.0
 
 
 @compiled

@@ -34,9 +34,10 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader
 
 from palpate.files import printable
-from palpate.model_file import ModelFileError, ReducedModel, load_model
+from palpate.model_file import ModelFileError, load_model
 from palpate_client.wire import Flags
-from palpate_server.coupling import fixed_patch
+from palpate_server.coupling import cross_fade, models
+from palpate_server.coupling.models import Model
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.records import COMMAND, PORT_RECORD, RECORDS, TICK
@@ -148,7 +149,7 @@ def _one_line(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:200]
 
 
-def compare(recorded: Recorded, models: Sequence[ReducedModel]) -> Comparison:
+def compare(recorded: Recorded, at_hand: Sequence[Model]) -> Comparison:
     """Repeat every tick from each state on for as long as ticks follow one another. Raises ReplayError."""
     ticks, ports = recorded.ticks, recorded.ports
     commands = _commands(ticks, ports)
@@ -161,7 +162,7 @@ def compare(recorded: Recorded, models: Sequence[ReducedModel]) -> Comparison:
         follows = k > 0 and ticks["tick"][k - 1] == tick - 1
         if tick in recorded.settings:
             begins = memory is None or not follows
-            memory = _restored(recorded.settings[tick], models, memory if follows else None, missing)
+            memory = _restored(recorded.settings[tick], at_hand, memory if follows else None, missing)
             if begins:
                 begin = tick
                 stretches += memory is not None
@@ -189,7 +190,7 @@ def _commands(ticks: NDArray[np.void], ports: NDArray[np.void]) -> NDArray[np.vo
     """The commands as the ticks used them, (t, n_tools) COMMAND."""
     commands = np.zeros(ports.shape, COMMAND)
     commands["tool"] = np.arange(ports.shape[1])
-    for name in ("sequence", "client_time_ns", "rendered_tick", "velocity_m_per_s"):
+    for name in ("sequence", "client_time_ns", "rendered_tick", "attach", "velocity_m_per_s"):
         commands[name] = ports[name]
     commands["position_m"] = ports["target_m"]
     commands["arrival_ns"] = ticks["start_ns"][:, None] - ports["input_age_ns"]
@@ -198,7 +199,7 @@ def _commands(ticks: NDArray[np.void], ports: NDArray[np.void]) -> NDArray[np.vo
 
 def _restored(
     message: dict[str, Any],
-    models: Sequence[ReducedModel],
+    at_hand: Sequence[Model],
     before: Memory | None,
     missing: dict[str, None],
 ) -> Memory | None:
@@ -206,7 +207,7 @@ def _restored(
     saved = snapshot.from_message(message)
     found = []
     for told in (message["model"], message["following"]):
-        model = next((m for m in models if snapshot.identity(m) == told), None)
+        model = next((m for m in at_hand if snapshot.identity(m) == told), None)
         if told is not None and model is None:
             missing[
                 f"{told['name']!r} (order {told['order']}, config_sha256 {told['config_sha256'][:12]})"
@@ -216,15 +217,11 @@ def _restored(
     model, following = found
     assert model is not None
     limits = [_ANY_LIMITS] * len(saved.ports)
-    if len(model.contacts) != len(limits):
-        raise ReplayError(
-            f"the recording is of {len(limits)} tools, {model.name!r} has {len(model.contacts)}"
-        )
-    memory = shared_memory.make_memory(model.discrete, model.period_s, limits, 1.0)
+    if (n_tools := len(models.tools_of(model))) != len(limits):
+        raise ReplayError(f"the recording is of {len(limits)} tools, {model.name!r} has {n_tools}")
+    memory = shared_memory.make_memory(models.make_running(model), model.period_s, limits, 1.0)
     if following is not None:
-        coupling = fixed_patch.cross_fade(
-            memory.coupling, following.discrete, np.zeros((len(limits), 3)), 1.0
-        )
+        coupling = cross_fade.to_another(memory.coupling, models.make_running(following), 1.0)
         memory = shared_memory.with_coupling(memory, coupling)
     if before is not None:
         memory = memory._replace(ring=before.ring)

@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from palpate.model_file import ReducedModel
+from palpate_server.coupling.models import Model
 from palpate_server.realtime.records import COMMAND, COUNTERS, PORT, SETTINGS, Change
 from palpate_server.realtime.shared_memory import Memory, Saved
 from palpate_server.recording.json_records import as_objects, from_objects
 
 
-def identity(model: ReducedModel) -> dict[str, Any]:
+def identity(model: Model) -> dict[str, Any]:
     """What tells a model from others in a recording."""
     return {"name": model.name, "order": model.order, "config_sha256": model.config_sha256}
 
 
-def as_message(memory: Memory, model: ReducedModel, following: ReducedModel | None) -> dict[str, Any]:
+def as_message(memory: Memory, model: Model, following: Model | None) -> dict[str, Any]:
     """The state that the last change saved; `following` is the model that is being faded in."""
     saved = memory.saved
     (counters,) = as_objects(saved.counters)

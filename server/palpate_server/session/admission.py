@@ -75,5 +75,6 @@ class Admission:
                 command.rendered_tick,
                 *position,
                 *command.velocity_m_per_s[name],
+                command.attach.get(name, False),
             )
         return None

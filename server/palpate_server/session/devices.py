@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from palpate.model_file import ReducedModel
+from palpate_server.coupling.models import Model
 from palpate_server.realtime.safety import Limits
 
 _CHAI3D = "CHAI3D 3 device specifications, github.com/chai3d/chai3d, src/devices"
@@ -61,7 +61,7 @@ def limits_for(profile: DeviceProfile, ceiling: Limits) -> Limits:
     )
 
 
-def warnings_for(device: Device, model: ReducedModel, tool: int, scale: float) -> list[str]:
+def warnings_for(device: Device, model: Model, tool: int, scale: float) -> list[str]:
     """Why `device` may not render a tool (by index) of `model` stably; `scale` is that of the client's frame."""
     rows = slice(3 * tool, 3 * tool + 3)
     stiffness = float(np.linalg.norm(model.continuous.d[rows, rows], 2)) * scale**2

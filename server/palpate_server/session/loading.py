@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from palpate.files import LONGEST_NAME_BYTES, is_plain_name
-from palpate.model_file import ModelFileError, ReducedModel
-from palpate_server.coupling import fixed_patch
+from palpate.model_file import ModelFileError
+from palpate_server.coupling import cross_fade, models
+from palpate_server.coupling.models import Model
 from palpate_server.errors import Refused
 from palpate_server.realtime import shared_memory
 from palpate_server.recording.snapshot import identity
@@ -52,22 +53,21 @@ class ModelLoader:
         finally:
             state.exchanging.release()
 
-    def _fade_to(self, model: ReducedModel) -> shared_memory.Memory:
+    def _fade_to(self, model: Model) -> shared_memory.Memory:
         """Cross-fade to a model that starts settled at the present displacement. Returns the memory to continue with."""
         state = self._state
         step = model.period_s / CROSS_FADE_S
-        coupling = fixed_patch.cross_fade(
-            state.memory.coupling, model.discrete, state.memory.displacement.copy(), step
-        )
+        following = models.make_settled(model, state.memory.displacement.copy())
+        coupling = cross_fade.to_another(state.memory.coupling, following, step)
         fading = shared_memory.with_coupling(state.memory, coupling)
-        memory = shared_memory.with_coupling(state.memory, fixed_patch.after_cross_fade(coupling))
+        memory = shared_memory.with_coupling(state.memory, cross_fade.after(coupling))
         state.exchange(fading, state.model, model)
         while coupling.fade[0] < 1.0:
             if state.stopping.wait(model.period_s):
                 raise Refused("stopping", "the server is stopping")
         return memory
 
-    def _end_exchange(self, memory: shared_memory.Memory, model: ReducedModel) -> None:
+    def _end_exchange(self, memory: shared_memory.Memory, model: Model) -> None:
         """Drop the old model. Ticks may be late, so this is tried until it succeeds or the server stops."""
         while True:
             try:
@@ -77,7 +77,7 @@ class ModelLoader:
                 if error.reason != "busy":
                     raise
 
-    def _read(self, name: object) -> ReducedModel:
+    def _read(self, name: object) -> Model:
         if not is_plain_name(name):
             raise Refused(
                 "bad_model",
@@ -91,7 +91,7 @@ class ModelLoader:
             model = load_model_elsewhere(path, self._state.stopping)
         except (OSError, RuntimeError, ModelFileError) as error:  # RuntimeError: links in a circle
             raise Refused("bad_model", str(error).replace(f"{self._folder}/", "")) from error
-        if (names := tuple(contact.name for contact in model.contacts)) != self._state.tools:
+        if (names := tuple(tool.name for tool in models.tools_of(model))) != self._state.tools:
             raise Refused(
                 "bad_model", f"{name}: its tools are {names}, the running model's are {self._state.tools}"
             )
@@ -103,7 +103,7 @@ class ModelLoader:
         return model
 
 
-def accuracy_warnings(model: ReducedModel) -> list[str]:
+def accuracy_warnings(model: Model) -> list[str]:
     """Warnings that follow from a model's own accuracy report; empty for a good one."""
     error, (low, high) = model.accuracy.error_in_band, model.accuracy.band_hz
     if error <= TOLERABLE_ERROR:

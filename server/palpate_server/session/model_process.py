@@ -20,7 +20,8 @@ import threading
 import time
 from pathlib import Path
 
-from palpate.model_file import ModelFileError, ReducedModel, load_model
+from palpate.model_file import ModelFileError, load_model
+from palpate_server.coupling.models import Model
 
 _TIMEOUT_S = 60.0
 _POLL_S = 0.01
@@ -31,7 +32,7 @@ _ALIGNMENT = 64
 _HEAD = struct.Struct("<QQ")  # bytes of the pickle, number of arrays; then the bytes of each array as <Q
 
 
-def load_model_elsewhere(path: Path, stopping: threading.Event) -> ReducedModel:
+def load_model_elsewhere(path: Path, stopping: threading.Event) -> Model:
     """The model in a file, as `load_model` gives it, its arrays read-only.
 
     Raises ModelFileError for what is no model, takes too long, or when `stopping` is set meanwhile; OSError.
@@ -63,7 +64,7 @@ def load_model_elsewhere(path: Path, stopping: threading.Event) -> ReducedModel:
         os.close(descriptor)
 
 
-def _receive(descriptor: int) -> ReducedModel:
+def _receive(descriptor: int) -> Model:
     view = memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ))
     n_pickle, n_arrays = _HEAD.unpack_from(view)
     sizes = struct.unpack_from(f"<{n_arrays}Q", view, _HEAD.size)
@@ -75,11 +76,11 @@ def _receive(descriptor: int) -> ReducedModel:
         place += -place % _ALIGNMENT
         arrays.append(view[place : place + size])
         place += size
-    model: ReducedModel = pickle.loads(pickled, buffers=arrays)
+    model: Model = pickle.loads(pickled, buffers=arrays)
     return model
 
 
-def _send(model: ReducedModel, descriptor: int) -> None:
+def _send(model: Model, descriptor: int) -> None:
     buffers: list[pickle.PickleBuffer] = []
     pickled = pickle.dumps(model, protocol=5, buffer_callback=buffers.append)
     arrays = [buffer.raw() for buffer in buffers]

@@ -14,6 +14,7 @@ import zenoh
 
 from palpate_client.wire import ENCODING, pack
 from palpate_server import codec
+from palpate_server.coupling import models
 from palpate_server.realtime import scheduler, threads
 from palpate_server.realtime.records import RECORDS
 from palpate_server.recording.black_box import BlackBox
@@ -34,7 +35,7 @@ class ForcePublisher:
         self._sending = threading.Lock()
         self._encoder = codec.ForceEncoder(len(state.tools))
         ring = state.memory.ring  # stays the same when the model is exchanged
-        self._start_ns, self._ports = ring.ticks["start_ns"], codec.as_words(ring.ports)
+        self._ticks, self._ports = codec.as_words(ring.ticks), codec.as_words(ring.ports)
         self._sent = 0
         self._publisher = _publisher(session, state.keys.force, zenoh.Priority.REAL_TIME, express=True)
 
@@ -64,7 +65,7 @@ class ForcePublisher:
                 self._sent = head - MAX_UNSENT
             while self._sent < head:
                 row = self._sent % RECORDS
-                message = self._encoder.encode(self._sent, self._start_ns[row], self._ports[row])
+                message = self._encoder.encode(self._ticks[row], self._ports[row])
                 self._publisher.put(message)
                 self._sent += 1
         finally:
@@ -117,14 +118,13 @@ class SurfacePublisher:
     def _publish(self) -> None:
         state = self._state
         with state.model_in_use:
-            surface = state.model.surface
-            model_state = np.zeros(state.model.order)
-            tick = scheduler.read_snapshot(state.image, model_state, self._tips)
+            model = state.model
+            shown_state = np.zeros(state.memory.coupling.shown_size())
+            tick = scheduler.read_snapshot(state.image, shown_state, self._tips)
         if tick <= self._last_tick:
             return
         self._last_tick = tick
-        displacement = surface.output @ model_state.astype(np.float32)
-        displacement += surface.feedthrough @ self._tips.ravel().astype(np.float32)
+        displacement = models.shown_displacement(model, shown_state, self._tips)
         self._publisher.put(codec.encode_surface(tick, time.monotonic_ns(), displacement))
 
 

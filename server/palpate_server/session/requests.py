@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from palpate_client.messages import Frame
+from palpate_server.coupling import models
 from palpate_server.errors import Refused
 from palpate_server.realtime import safety, scheduler
 from palpate_server.realtime.safety import Limits
@@ -135,7 +136,7 @@ class Requests:
         """Put a silent tool to rest in a client's frame, with these limits."""
         state = self._state
         tool = state.tool_index[name]
-        home = frame.point_at_client(state.model.contacts[tool].center_m)
+        home = frame.point_at_client(models.tools_of(state.model)[tool].start_m)
         settings = (
             state.leases.settings
         )  # updated after each change, so that they are right even if the second change fails

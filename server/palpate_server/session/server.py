@@ -13,9 +13,10 @@ from typing import Any
 
 import zenoh
 
-from palpate.model_file import ReducedModel
 from palpate_client.wire import Keys, pack
 from palpate_server import codec
+from palpate_server.coupling import models
+from palpate_server.coupling.models import Model
 from palpate_server.realtime import safety, scheduler, shared_memory, threads
 from palpate_server.realtime.safety import Limits
 from palpate_server.recording.black_box import BlackBox
@@ -63,9 +64,7 @@ class Server:
     sends the status. Loading a model and recording have a thread of their own while they last.
     """
 
-    def __init__(
-        self, model: ReducedModel, session: zenoh.Session, keys: Keys, options: ServerOptions
-    ) -> None:
+    def __init__(self, model: Model, session: zenoh.Session, keys: Keys, options: ServerOptions) -> None:
         state = SessionState(model, options.limits, keys, 1 / options.surface_hz)
         self.state = state
         self._session = session
@@ -90,9 +89,7 @@ class Server:
             keys,
             self._requests,
             describe=lambda: pack(description(state)),
-            geometry=lambda: codec.encode_geometry(
-                state.model.surface.vertices, state.model.surface.triangles
-            ),
+            geometry=lambda: codec.encode_geometry(*models.surface_at_rest(state.model)),
             on_change=self._status.publish,  # so that a status shows every setting
         )
         self._command_thread_prepared = False
@@ -175,7 +172,7 @@ class Server:
 
 
 def serve(
-    model: ReducedModel,
+    model: Model,
     session: zenoh.Session,
     keys: Keys,
     options: ServerOptions,

@@ -8,9 +8,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from palpate.model_file import ReducedModel
 from palpate_client.messages import Frame
 from palpate_client.wire import MALFORMED, REFUSED, Keys
+from palpate_server.coupling import models
+from palpate_server.coupling.models import Model
 from palpate_server.errors import Refused
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
@@ -51,16 +52,17 @@ class SessionState:
     model_in_use   lock: the model is not exchanged while the surface is computed from it
     """
 
-    def __init__(self, model: ReducedModel, limits: Limits, keys: Keys, surface_period_s: float) -> None:
+    def __init__(self, model: Model, limits: Limits, keys: Keys, surface_period_s: float) -> None:
         self.model = model
         self.limits = limits
         self.keys = keys
         self.surface_period_s = surface_period_s
-        self.tools = tuple(contact.name for contact in model.contacts)
+        tools = models.tools_of(model)
+        self.tools = tuple(tool.name for tool in tools)
         self.tool_index = {name: i for i, name in enumerate(self.tools)}
-        homes = [contact.center_m for contact in model.contacts]
+        homes = [tool.start_m for tool in tools]
         self.memory = shared_memory.make_memory(
-            model.discrete, model.period_s, [limits] * len(self.tools), surface_period_s, homes
+            models.make_running(model), model.period_s, [limits] * len(tools), surface_period_s, homes
         )
         self.lease_numbers = [0] * len(self.tools)
         self.image = make_image(self.memory)
@@ -75,7 +77,7 @@ class SessionState:
         self.exchanging = threading.Lock()
         self.model_in_use = threading.Lock()
         self._changing = threading.Lock()  # the loop has one slot for changes
-        self._following: ReducedModel | None = None  # the model that is being faded in
+        self._following: Model | None = None  # the model that is being faded in
 
     def check_running(self) -> None:
         """Raises Refused once the server stops."""
@@ -104,9 +106,7 @@ class SessionState:
             self._change(ask, *what)
             self._record_settings()
 
-    def exchange(
-        self, memory: shared_memory.Memory, model: ReducedModel, following: ReducedModel | None
-    ) -> None:
+    def exchange(self, memory: shared_memory.Memory, model: Model, following: Model | None) -> None:
         """Have the loop continue with another memory, of a model and of the one that is faded in; as `between_ticks`."""
         with self._changing:
             self._change(scheduler.exchange, make_image(memory))

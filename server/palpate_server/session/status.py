@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_client.wire import DROPPED, SCHEMA_VERSION, Flags, Kind
+from palpate_server.coupling import models
 from palpate_server.realtime import safety, scheduler, shared_memory
 from palpate_server.realtime.records import RECORDS
 from palpate_server.recording.snapshot import identity
@@ -119,12 +120,12 @@ def description(state: SessionState) -> dict[str, Any]:
         "period_s": state.model.period_s,
         "tools": [
             {
-                "name": contact.name,
-                "start_m": contact.center_m,
-                "normal": contact.normal,
-                "radius_m": contact.radius_m,
+                "name": tool.name,
+                "start_m": tool.start_m,
+                "normal": tool.normal,
+                "radius_m": tool.radius_m,
             }
-            for contact in state.model.contacts
+            for tool in models.tools_of(state.model)
         ],
         "limits": state.limits._asdict(),
         "devices": {name: asdict(profile) for name, profile in PROFILES.items()},

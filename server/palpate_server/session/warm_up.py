@@ -8,8 +8,8 @@ import threading
 
 import numpy as np
 
-from palpate.model_file import StateSpace
 from palpate_server import codec
+from palpate_server.coupling import running
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import Limits
@@ -32,21 +32,14 @@ def warm_up(period_s: float, n_tools: int) -> None:
 
 
 def _call_each(period_s: float, n_tools: int) -> None:
-    channels = 3 * n_tools
-    system = StateSpace(
-        np.zeros(2),
-        np.zeros(2),
-        np.zeros((2, channels)),
-        np.zeros((channels, 2)),
-        np.zeros((channels, channels)),
-    )
     limits = [Limits(1.0, 1.0, 1.0, 1.0, 1.0)] * n_tools
-    memory = shared_memory.make_memory(system, period_s, limits, period_s)
+    memory = shared_memory.make_memory(running.empty(), period_s, limits, period_s)
     scheduler.forget_command(memory.commands, 0)
     image = make_image(memory)
     scheduler.arrive(image, 1)
     scheduler.records_written(memory.shared)
-    codec.ForceEncoder(n_tools).encode(0, 0, codec.as_words(memory.ring.ports)[0])
+    ring = memory.ring
+    codec.ForceEncoder(n_tools).encode(codec.as_words(ring.ticks)[0], codec.as_words(ring.ports)[0])
     scheduler.is_silent(image, 0)
     scheduler.set_frame(image, 0, np.eye(3), 1.0, np.zeros(3))
     scheduler.set_limits(image, 0, np.ones(len(Limits._fields)))
@@ -55,7 +48,7 @@ def _call_each(period_s: float, n_tools: int) -> None:
     scheduler.exchange(image, make_image(memory))
     scheduler.is_changed(image)
     scheduler.withdraw_change(image)
-    scheduler.read_snapshot(image, np.zeros(2), np.zeros((n_tools, 3)))
+    scheduler.read_snapshot(image, np.zeros(0), np.zeros((n_tools, 3)))
     scheduler.stop(memory.shared)
     wake = os.eventfd(0)
     scheduler.run_at_deadlines(image, wake)

@@ -10,6 +10,7 @@ from numba import njit
 
 from palpate.model_file import ReducedModel, StateSpace
 from palpate_server.bodies import state_space
+from palpate_server.coupling.models import make_running
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.dot import LANES, dot
@@ -98,7 +99,9 @@ def test_every_force_is_rounded_the_same_wherever_its_code_was_compiled() -> Non
     """Ticks, in which the kernel is compiled into other code, against the same operations one at a time."""
     model = spring_mass_model(2, 50)
     system = model.discrete
-    memory = shared_memory.make_memory(system, model.period_s, [Limits(1e6, 1e12, 1e6, 1e6, 0.0)] * 2, 1 / 30)
+    memory = shared_memory.make_memory(
+        make_running(model), model.period_s, [Limits(1e6, 1e12, 1e6, 1e6, 0.0)] * 2, 1 / 30
+    )
     image = make_image(memory)
     random = np.random.default_rng(4)
     state = np.zeros(system.order)
@@ -107,7 +110,7 @@ def test_every_force_is_rounded_the_same_wherever_its_code_was_compiled() -> Non
         displacement = 1e-3 * random.normal(size=6)
         for contact in range(2):
             target = displacement[3 * contact : 3 * contact + 3]
-            memory.commands.newest[contact] = (contact, 0, tick, 0, now, -1, target, (0.0, 0.0, 0.0))
+            memory.commands.newest[contact] = (contact, 0, tick, 0, now, -1, target, (0.0, 0.0, 0.0), 0)
         scheduler.repeat_tick(image, now, now, False)
         force = [
             summed_in_the_stated_order(c, state) + summed_in_the_stated_order(d, displacement)
@@ -119,5 +122,5 @@ def test_every_force_is_rounded_the_same_wherever_its_code_was_compiled() -> Non
         for column, u in zip(system.b.T, displacement, strict=True):
             following = following + column * u
         state = following
-    np.testing.assert_array_equal(memory.coupling.body.state, state)
+    np.testing.assert_array_equal(memory.coupling.running.patch.body.state, state)
     assert np.all(memory.force != 0.0)

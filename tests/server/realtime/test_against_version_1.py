@@ -18,7 +18,8 @@ import pytest
 
 from palpate.model_file import StateSpace
 from palpate_client.wire import Flags
-from palpate_server.coupling import fixed_patch
+from palpate_server.coupling import cross_fade
+from palpate_server.diagnostics.sample_model import patches_of
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import Image, make_image
 from palpate_server.realtime.records import RECORDS, Change
@@ -42,7 +43,7 @@ class Today:
 
     def __init__(self, n_tools: int, model: StateSpace, other: StateSpace) -> None:
         self.other = other
-        self.memory = shared_memory.make_memory(model, 1e-3, [LIMITS] * n_tools, 1 / 30)
+        self.memory = shared_memory.make_memory(patches_of(model), 1e-3, [LIMITS] * n_tools, 1 / 30)
         self.image: Image = make_image(self.memory)
         self.kept: list[Memory] = [self.memory]
 
@@ -58,12 +59,13 @@ class Today:
                 scheduler.reset(self.image)
             case Change.EXCHANGE:
                 running = self.memory.coupling
-                if fixed_patch.is_fading(running):
-                    coupling = fixed_patch.after_cross_fade(running)
+                if running.fade[1] > 0:
+                    coupling = cross_fade.after(running)
                 else:
                     displacement = self.memory.displacement.copy()
                     np.testing.assert_array_equal(displacement.ravel(), values[: displacement.size])
-                    coupling = fixed_patch.cross_fade(running, self.other, displacement, FADE_STEP)
+                    following = patches_of(self.other, displacement)
+                    coupling = cross_fade.to_another(running, following, FADE_STEP)
                 self.memory = shared_memory.with_coupling(self.memory, coupling)
                 self.kept.append(self.memory)
                 scheduler.exchange(self.image, make_image(self.memory))

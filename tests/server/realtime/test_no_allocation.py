@@ -13,7 +13,7 @@ from numba.core.runtime.nrt import rtsys
 
 from palpate.model_file import ReducedModel
 from palpate_client.wire import Flags
-from palpate_server.coupling import fixed_patch
+from palpate_server.coupling import cross_fade, models
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import Image, make_image
 from palpate_server.realtime.records import RECORDS
@@ -98,7 +98,9 @@ class Ticks:
 @pytest.fixture
 def ticks(make_spring_mass_model: Callable[..., ReducedModel]) -> Ticks:
     model = make_spring_mass_model(2)
-    return Ticks(shared_memory.make_memory(model.discrete, model.period_s, [LIMITS, LIMITS], 1 / 30))
+    return Ticks(
+        shared_memory.make_memory(models.make_running(model), model.period_s, [LIMITS, LIMITS], 1 / 30)
+    )
 
 
 def test_the_count_sees_every_array_that_compiled_code_makes() -> None:
@@ -135,19 +137,19 @@ def test_no_tick_allocates_while_one_model_fades_into_another(
     ticks: Ticks, make_spring_mass_model: Callable[..., ReducedModel]
 ) -> None:
     assert ticks.allocations(commanded_ticks, 300) == 0
-    other = make_spring_mass_model(2, 7).discrete
-    coupling = fixed_patch.cross_fade(ticks.memory.coupling, other, np.zeros((2, 3)), 0.01)
+    other = models.make_settled(make_spring_mass_model(2, 7), np.zeros((2, 3)))
+    coupling = cross_fade.to_another(ticks.memory.coupling, other, 0.01)
     fading = shared_memory.with_coupling(ticks.memory, coupling)
     scheduler.exchange(ticks.image, make_image(fading))
     assert ticks.allocations(commanded_ticks, 50) == 0
     assert scheduler.is_changed(ticks.image)
     assert coupling.fade[0] == pytest.approx(0.5)
-    assert np.any(coupling.following.state)
+    assert np.any(coupling.following.patch.body.state)
 
 
 def test_a_tick_with_a_fault_does_not_allocate(ticks: Ticks) -> None:
     assert ticks.allocations(commanded_ticks, 300) == 0
-    ticks.memory.coupling.body.state[0] = np.nan
+    ticks.memory.coupling.running.patch.body.state[0] = np.nan
     assert ticks.allocations(commanded_ticks, 10) == 0
     assert ticks.seen(Flags.FAULT)
     assert ticks.memory.counters["faults"][0] == 1

@@ -14,7 +14,8 @@ from numba import njit
 from palpate.model_file import ReducedModel, StateSpace
 from palpate_client.wire import Flags
 from palpate_server.bodies import state_space
-from palpate_server.coupling import fixed_patch
+from palpate_server.coupling import cross_fade, models
+from palpate_server.diagnostics.sample_model import patches_of
 from palpate_server.realtime import safety, scheduler, shared_memory
 from palpate_server.realtime.clock import monotonic_ns
 from palpate_server.realtime.native_image import Image, make_image
@@ -46,7 +47,7 @@ def write(
 ) -> None:
     """Put a command where the next tick finds it, whatever its numbers are."""
     held = memory.commands.lease[tool] if lease is None else lease
-    memory.commands.newest[tool] = (tool, held, sequence, 7, arrival_ns, rendered_tick, target, velocity)
+    memory.commands.newest[tool] = (tool, held, sequence, 7, arrival_ns, rendered_tick, target, velocity, 0)
 
 
 def command(
@@ -78,7 +79,7 @@ def tallies(memory: shared_memory.Memory) -> list[int]:
 @pytest.fixture
 def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> shared_memory.Memory:
     model = make_spring_mass_model()
-    return shared_memory.make_memory(model.discrete, model.period_s, [FREE], 1 / 30)
+    return shared_memory.make_memory(models.make_running(model), model.period_s, [FREE], 1 / 30)
 
 
 @pytest.fixture
@@ -183,7 +184,7 @@ def test_recovery_in_the_middle_of_the_fading_goes_on_from_there(memory: shared_
 def test_a_jump_is_followed_at_the_speed_limit(make_spring_mass_model: Callable[..., ReducedModel]) -> None:
     model = make_spring_mass_model()
     memory = shared_memory.make_memory(
-        model.discrete, model.period_s, [FREE._replace(max_speed_m_per_s=0.5)], 1 / 30
+        models.make_running(model), model.period_s, [FREE._replace(max_speed_m_per_s=0.5)], 1 / 30
     )
     depths = []
     for i in range(40):
@@ -227,7 +228,7 @@ def test_a_model_that_gives_nan_is_put_to_rest_and_counted(memory: shared_memory
     for i in range(10):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
-    memory.coupling.body.state[0] = np.nan
+    memory.coupling.running.patch.body.state[0] = np.nan
     flags, _, force, scale = tick(memory)
     assert flags & Flags.FAULT
     assert scale == 0
@@ -265,7 +266,9 @@ SPRING_N_PER_M = 1000.0
 def spring() -> shared_memory.Memory:
     """A spring without memory: what it gives is the displacement of this very tick."""
     nothing = np.zeros(2), np.zeros(2), np.zeros((2, 3)), np.zeros((3, 2))
-    return shared_memory.make_memory(StateSpace(*nothing, SPRING_N_PER_M * np.eye(3)), 1e-3, [USUAL], 1 / 30)
+    return shared_memory.make_memory(
+        patches_of(StateSpace(*nothing, SPRING_N_PER_M * np.eye(3))), 1e-3, [USUAL], 1 / 30
+    )
 
 
 def hand_over(memory: shared_memory.Memory, scale: float, origin: tuple[float, float, float]) -> None:
@@ -378,7 +381,8 @@ def test_extreme_numbers_hold_the_tip_and_leave_another_contact_alone(
     model = make_spring_mass_model(2)
     usual = Limits(10.0, 2000.0, 1.0, 0.1, 0.0)
     memory, undisturbed = (
-        shared_memory.make_memory(model.discrete, model.period_s, [usual, usual], 1 / 30) for _ in range(2)
+        shared_memory.make_memory(models.make_running(model), model.period_s, [usual, usual], 1 / 30)
+        for _ in range(2)
     )
     huge = (sign * 1.797e308,) * 3
     for i in range(300):
@@ -487,9 +491,9 @@ def test_a_client_that_hovers_at_the_surface_does_not_leave_the_state_to_decay_f
     for i in range(300, 20_000):
         command(memory, i, (0.0, 0.0, 0.0))
         tick(memory)
-        if not np.any(memory.coupling.body.state):
+        if not np.any(memory.coupling.running.patch.body.state):
             break
-    assert not np.any(memory.coupling.body.state)
+    assert not np.any(memory.coupling.running.patch.body.state)
 
 
 def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(
@@ -498,7 +502,7 @@ def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(
     for i in range(250):
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
-    assert np.any(memory.coupling.body.state)
+    assert np.any(memory.coupling.running.patch.body.state)
     scheduler.reset(make_image(memory))
     assert not scheduler.is_changed(make_image(memory))
     command(memory, 250, (0.0, 0.0, 1e-3))
@@ -517,12 +521,15 @@ def test_another_model_is_faded_in_where_it_settles(
     running = make_spring_mass_model().discrete
     for i in range(300):
         if i == 250:  # the soft start is over: the running model has settled too
-            memory.coupling.body.state[:] = state_space.make_body(running, np.array(position)).state
+            memory.coupling.running.patch.body.state[:] = state_space.make_body(
+                running, np.array(position)
+            ).state
         command(memory, i, position)
         *_, before, _ = tick(memory)
     other = make_spring_mass_model(1, 7).discrete
-    fading = fixed_patch.cross_fade(memory.coupling, other, np.array([position]), 0.01)
-    settled = fading.following.state.copy()
+    following = patches_of(other, np.array([position]))
+    fading = cross_fade.to_another(memory.coupling, following, 0.01)
+    settled = following.patch.body.state.copy()
     np.testing.assert_allclose(other.dense_a() @ settled + other.b @ np.array(position), settled, atol=1e-15)
 
     image = make_image(memory)
@@ -538,7 +545,7 @@ def test_another_model_is_faded_in_where_it_settles(
     expected = before + np.linspace(0, 1, 101)[:, None] * (final - before)
     np.testing.assert_allclose(forces, expected, rtol=0, atol=1e-6 * np.abs(final).max())
 
-    done = shared_memory.with_coupling(memory, fixed_patch.after_cross_fade(fading))
+    done = shared_memory.with_coupling(memory, cross_fade.after(fading))
     scheduler.exchange(image, make_image(done))
     command(memory, 400, position)
     repeat_tick(image, now_ns(memory))
@@ -548,7 +555,7 @@ def test_another_model_is_faded_in_where_it_settles(
 def arrive(memory: shared_memory.Memory, sequence: int, arrival_ns: int, depth_m: float = 0.0) -> int:
     """A command comes at this time; the ticks that ran, or minus the reason."""
     lease = memory.commands.lease[0]
-    memory.commands.incoming[0] = (0, lease, sequence, 7, arrival_ns, -1, (0.0, 0.0, depth_m), STILL)
+    memory.commands.incoming[0] = (0, lease, sequence, 7, arrival_ns, -1, (0.0, 0.0, depth_m), STILL, 0)
     return int(scheduler.arrive(make_image(memory), 1))
 
 
@@ -615,13 +622,13 @@ def test_a_released_tissue_comes_to_rest_exactly(memory: shared_memory.Memory) -
     scheduler.forget_command(memory.commands, 0)
     for _ in range(20_000):
         tick(memory)
-        if not np.any(memory.coupling.body.state):
+        if not np.any(memory.coupling.running.patch.body.state):
             break
-    np.testing.assert_array_equal(memory.coupling.body.state, 0)
+    np.testing.assert_array_equal(memory.coupling.running.patch.body.state, 0)
     ticks = int(memory.counters["ticks"][0])
     np.testing.assert_array_less(np.abs(memory.ring.ports["force_n"][ticks - 500 : ticks]), 1e-9)
     tick(memory)
-    np.testing.assert_array_equal(memory.coupling.body.state, 0)
+    np.testing.assert_array_equal(memory.coupling.running.patch.body.state, 0)
 
 
 def test_ticks_with_a_client_and_those_with_a_new_command_are_counted(memory: shared_memory.Memory) -> None:
@@ -717,7 +724,7 @@ def test_no_tick_sees_half_a_message_of_several_tools(
     make_spring_mass_model: Callable[..., ReducedModel],
 ) -> None:
     model = make_spring_mass_model(2)
-    memory = shared_memory.make_memory(model.discrete, model.period_s, [FREE, FREE], 1 / 30)
+    memory = shared_memory.make_memory(models.make_running(model), model.period_s, [FREE, FREE], 1 / 30)
     image = make_image(memory)
     incoming = memory.commands.incoming
     _write_to_all(image, incoming, 0, 1)
@@ -752,7 +759,7 @@ def test_no_tick_sees_half_a_message_of_several_tools(
 
 def test_a_snapshot_belongs_to_one_tick(make_spring_mass_model: Callable[..., ReducedModel]) -> None:
     model = make_spring_mass_model()
-    memory = shared_memory.make_memory(model.discrete, model.period_s, [FREE], 1e-3)
+    memory = shared_memory.make_memory(models.make_running(model), model.period_s, [FREE], 1e-3)
     system: StateSpace = model.discrete
     expected = np.zeros(system.order)
     state, applied = np.zeros(system.order), np.zeros((1, 3))
@@ -786,3 +793,34 @@ def test_a_force_that_is_no_number_never_reaches_the_device_and_the_next_client_
     assert not flags & Flags.FAULT
     assert scale == 1
     assert np.any(force)
+
+
+def test_a_record_says_how_a_tool_of_a_patch_touches_and_what_work_it_did(
+    spring: shared_memory.Memory,
+) -> None:
+    """A bare spring: its energy is known. The record's work less what was withheld is the work against the force sent."""
+    home = np.array((0.1, 0.0, 0.0))
+    hand_over(spring, 2.0, (0.1, 0.0, 0.0))
+    rendered, steps, applied = 0.0, 0.0, home.copy()
+    for i in range(400):
+        depth = 1e-3 * np.sin(2 * np.pi * i / 300)
+        command(spring, i, tuple(home - (0.0, 0.0, depth)))
+        tick(spring)
+        record = newest(spring)
+        position, force = record["position_m"][0].copy(), record["force_n"][0]
+        rendered -= force @ (position - applied)
+        steps += float(np.sum((position - applied) ** 2))
+        applied = position
+    work, withheld = record["work_j"][0], record["withheld_j"][0]
+    assert work - withheld == pytest.approx(rendered, rel=1e-12)
+    # The sum of K x_n (x_n - x_(n-1)) is 1/2 K x^2 and half of K times the squared steps; twice as far in the model.
+    energy = 0.5 * SPRING_N_PER_M * 2.0**2 * (np.sum((applied - home) ** 2) + steps)
+    assert work == pytest.approx(energy, rel=1e-9)
+    assert withheld > 0  # the soft start
+    assert record["penetration_m"][0] == pytest.approx((home - applied)[2])
+    assert record["n_contact_points"][0] == 1
+    assert not record["flags"][0] & (Flags.IN_CONTACT | Flags.SLIDING | Flags.ATTACHED)
+    scheduler.forget_command(spring.commands, 0)
+    scheduler.reset(make_image(spring))
+    tick(spring)
+    assert newest(spring)["work_j"][0] == 0.0

@@ -11,7 +11,7 @@ import pytest
 
 from palpate.model_file import ReducedModel
 from palpate_client.wire import Keys, pack
-from palpate_server.coupling import fixed_patch
+from palpate_server.coupling import cross_fade, models
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import Limits
@@ -27,7 +27,7 @@ class Loop:
     def __init__(self, model: ReducedModel) -> None:
         self.model, self.following = model, None
         limits = [LIMITS] * len(model.contacts)
-        self.memory = shared_memory.make_memory(model.discrete, model.period_s, limits, 1.0)
+        self.memory = shared_memory.make_memory(models.make_running(model), model.period_s, limits, 1.0)
         self.image = make_image(self.memory)
         self.random = np.random.default_rng(1)
         self.sequence = 0
@@ -65,12 +65,11 @@ class Loop:
 
     def load(self, model: ReducedModel) -> None:
         """Fade over to another model within 100 ticks."""
-        coupling = fixed_patch.cross_fade(
-            self.memory.coupling, model.discrete, self.memory.displacement.copy(), 0.01
-        )
+        following = models.make_settled(model, self.memory.displacement.copy())
+        coupling = cross_fade.to_another(self.memory.coupling, following, 0.01)
         self._exchange(coupling, self.model, model)
         self.run(100)
-        self._exchange(fixed_patch.after_cross_fade(coupling), model, None)
+        self._exchange(cross_fade.after(coupling), model, None)
 
     def _exchange(self, coupling: Any, model: ReducedModel, following: Any) -> None:
         self.memory = shared_memory.with_coupling(self.memory, coupling)

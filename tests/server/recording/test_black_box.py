@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from palpate.model_file import ReducedModel
+from palpate_server.coupling.models import make_running
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import HOLD_NS, Limits
@@ -27,7 +28,7 @@ def run(memory: Memory, ticks: int, depth_m: float, first: int = 0) -> None:
         now = time.monotonic_ns()
         memory.shared[shared_memory.DEADLINE_NS] = now + PERIOD_NS // 4
         position, still = (0.0, 0.0, depth_m), (0.0, 0.0, 0.0)
-        memory.commands.incoming[0] = (0, lease, i, 7, now, -1, position, still)
+        memory.commands.incoming[0] = (0, lease, i, 7, now, -1, position, still, 0)
         assert scheduler.arrive(image, 1) == 1
 
 
@@ -46,7 +47,7 @@ def silence(memory: Memory, ticks: int, *, released: bool = False) -> None:
 def memory(make_spring_mass_model: Callable[..., ReducedModel]) -> Memory:
     model = make_spring_mass_model()
     return shared_memory.make_memory(
-        model.discrete, model.period_s, [Limits(0.01, 1e9, 1e6, 1.0, 0.0)], 1 / 30
+        make_running(model), model.period_s, [Limits(0.01, 1e9, 1e6, 1.0, 0.0)], 1 / 30
     )
 
 
@@ -104,7 +105,9 @@ def test_a_fault_and_a_storm_of_limits_are_named(memory: Memory, tmp_path: Path)
     writing.join()
     assert len(list(tmp_path.glob("*-limits.npz"))) == 1
 
-    memory.coupling.body.state[0] = np.nan  # right after: a fault is not lost because of what came before it
+    memory.coupling.running.patch.body.state[0] = (
+        np.nan
+    )  # right after: a fault is not lost because of what came before it
     run(memory, 5, 0.0, first=2000)
     writing = box.examine()
     assert writing is not None

@@ -9,6 +9,7 @@ import pytest
 
 from palpate.model_file import ReducedModel
 from palpate_client.wire import Flags, Keys, Kind, pack, unpack
+from palpate_server.coupling.models import make_running
 from palpate_server.realtime import shared_memory
 from palpate_server.realtime.safety import Limits
 from palpate_server.session import status
@@ -42,7 +43,7 @@ def test_success_rate_is_the_share_of_recent_ticks_with_a_new_command(
 ) -> None:
     model = make_spring_mass_model()
     limits = Limits(1.0, 1.0, 1.0, 1.0, 0.0)
-    memory = shared_memory.make_memory(model.discrete, model.period_s, [limits], 1 / 30)
+    memory = shared_memory.make_memory(make_running(model), model.period_s, [limits], 1 / 30)
     assert status.success_rate(memory, 0) == 0
     memory.shared[shared_memory.HEAD] = 500
     memory.ring.ports["flags"][:500] = int(Flags.STALE)
