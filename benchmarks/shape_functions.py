@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.meshfree.kernel import evaluate
+from palpate.meshfree.kernel import Evaluated, Pairs, evaluate
 from palpate.meshfree.neighbors import covering_nodes
 
 Array = NDArray[np.float64]
@@ -27,9 +27,8 @@ def compiled(
 ) -> Array:
     """(10, nnz): value, three first and six second derivatives."""
     out = np.empty((10, len(indices)))
-    evaluate(
-        points, x, indptr, indices, radii[indices], order, 2, out[0], out[1:4], out[4:], np.empty(len(points))
-    )
+    pairs = Pairs(indptr, indices, radii[indices])
+    evaluate(points, x, pairs, order, 2, Evaluated(out[0], out[1:4], out[4:], np.empty(len(points))))
     return out
 
 

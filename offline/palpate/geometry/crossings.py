@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,9 +19,8 @@ _SLACK = 1e-9
 """How far beyond a triangle's edge a segment still hits it, and from its own ends no longer, as a fraction of each."""
 
 
-@dataclass(frozen=True)
-class TriangleGrid:
-    """A surface's triangles by the cells that their boxes overlap.
+class TriangleGrid(NamedTuple):
+    """A surface's triangles by the cells that their boxes overlap. A NamedTuple, as compiled code takes no data classes.
 
     low      (3,), lowest corner of the grid, m
     size_m   edge of a cell, m
@@ -41,9 +40,7 @@ class TriangleGrid:
     def crossed(self, starts: Array, ends: Array) -> NDArray[np.bool_]:
         """(n,): whether the segments between the points (n, 3) and (n, 3), m, cross the surface between their ends."""
         starts, ends = np.ascontiguousarray(starts, float), np.ascontiguousarray(ends, float)
-        return _crossed(
-            starts, ends, self.low, self.size_m, self.shape, self.starts, self.members, self.corners
-        )
+        return _crossed(starts, ends, self)
 
 
 def triangle_grid(surface: TriangleSurface, size_m: float) -> TriangleGrid:
@@ -85,16 +82,8 @@ def _cells(first: Indices, last: Indices, shape: Indices) -> tuple[Indices, Indi
 
 
 @njit(cache=True)
-def _crossed(
-    begins: Array,
-    ends: Array,
-    low: Array,
-    size: float,
-    shape: Indices,
-    starts: Indices,
-    members: Indices,
-    corners: Array,
-) -> NDArray[np.bool_]:
+def _crossed(begins: Array, ends: Array, grid: TriangleGrid) -> NDArray[np.bool_]:
+    low, size, shape, starts = grid.low, grid.size_m, grid.shape, grid.starts
     crossed = np.zeros(len(begins), np.bool_)
     for i in range(len(begins)):
         ax, ay, az = begins[i, 0] - low[0], begins[i, 1] - low[1], begins[i, 2] - low[2]
@@ -111,7 +100,7 @@ def _crossed(
                 for y in range(y_first, y_last + 1):
                     row = (x * shape[1] + y) * shape[2]
                     for m in range(starts[row + z_first], starts[row + z_last + 1]):
-                        if not crossed[i] and _crosses(begins, ends, i, corners, members[m]):
+                        if not crossed[i] and _crosses(begins, ends, i, grid.corners, grid.members[m]):
                             crossed[i] = True
             if crossed[i]:
                 break

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
@@ -20,23 +22,37 @@ def quartic_spline(s: NDArray[np.float64]) -> NDArray[np.float64]:
     return t * t * t * (1.0 + 3.0 * s)
 
 
+class Pairs(NamedTuple):
+    """The pairs of a point and a node whose support covers it, point by point.
+
+    indptr (n_points + 1,), indices (nnz,): the nodes of each point, as in a sparse matrix
+    reach   (nnz,), m, the support radius of each pair
+    """
+
+    indptr: NDArray[np.int32]
+    indices: NDArray[np.int32]
+    reach: NDArray[np.float64]
+
+
+class Evaluated(NamedTuple):
+    """What `evaluate` fills: value (nnz,), first (dim, nnz), second (dim (dim + 1) / 2, nnz), pivot (n_points,)."""
+
+    value: NDArray[np.float64]
+    first: NDArray[np.float64]
+    second: NDArray[np.float64]
+    pivot: NDArray[np.float64]
+
+
 @njit(parallel=True, cache=True, fastmath=REORDER)
 def evaluate(
     points: NDArray[np.float64],
     nodes: NDArray[np.float64],
-    indptr: NDArray[np.int32],
-    indices: NDArray[np.int32],
-    reach: NDArray[np.float64],
+    pairs: Pairs,
     order: int,
     derivatives: int,
-    value: NDArray[np.float64],
-    first: NDArray[np.float64],
-    second: NDArray[np.float64],
-    pivot: NDArray[np.float64],
+    out: Evaluated,
 ) -> None:
-    """Fill value (nnz,), first (dim, nnz) and second (dim (dim + 1) / 2, nnz); pivot (n_points,) tells regular supports.
-
-    reach (nnz,), m, is the support radius of each pair of point and node.
+    """Fill `out` with the shape functions at the points (n_points, dim) and their derivatives up to `derivatives`.
 
     With the basis p centered at the point and frozen there, h_J = w_J p_J^T c and A c = p, so differentiating A c = p
     gives every derivative from the same Cholesky factor, with A's own derivatives only ever applied:
@@ -46,6 +62,8 @@ def evaluate(
 
     pivot is the smallest Cholesky pivot over its diagonal entry: 0 where A is singular (the row is then left unset).
     """
+    indptr, indices, reach = pairs.indptr, pairs.indices, pairs.reach
+    value, first, second, pivot = out.value, out.first, out.second, out.pivot
     n_points, dim = points.shape
     n_second = dim * (dim + 1) // 2
     size = 1 + dim if order == 1 else 1 + dim + n_second

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from palpate.geometry.visibility import Gaps
-from palpate.meshfree.kernel import evaluate
+from palpate.meshfree.kernel import Evaluated, Pairs, evaluate
 from palpate.meshfree.neighbors import covering_nodes, covering_nodes_inside
 
 SMALLEST_PIVOT = 1e-8
@@ -73,17 +73,19 @@ def shape_functions(
     else:
         (indptr, indices), reach = covering_nodes_inside(points, nodes, radii, gaps)
     n_second = dim * (dim + 1) // 2
-    value = np.empty(len(indices))
-    first = np.empty((dim if derivatives >= 1 else 0, len(indices)))
-    second = np.empty((n_second if derivatives >= 2 else 0, len(indices)))
-    pivot = np.empty(len(points))
-    evaluate(points, nodes, indptr, indices, reach, order, derivatives, value, first, second, pivot)
-    _require_regular_supports(points, np.diff(indptr), pivot, 1 + dim + (n_second if order == 2 else 0))
+    out = Evaluated(
+        np.empty(len(indices)),
+        np.empty((dim if derivatives >= 1 else 0, len(indices))),
+        np.empty((n_second if derivatives >= 2 else 0, len(indices))),
+        np.empty(len(points)),
+    )
+    evaluate(points, nodes, Pairs(indptr, indices, reach), order, derivatives, out)
+    _require_regular_supports(points, np.diff(indptr), out.pivot, 1 + dim + (n_second if order == 2 else 0))
 
     def matrix(data: NDArray[np.float64]) -> csr_array:
         return csr_array((data, indices, indptr), shape=(len(points), n_nodes))
 
-    return ShapeFunctions(matrix(value), tuple(map(matrix, first)), tuple(map(matrix, second)))
+    return ShapeFunctions(matrix(out.value), tuple(map(matrix, out.first)), tuple(map(matrix, out.second)))
 
 
 def _require_regular_supports(
