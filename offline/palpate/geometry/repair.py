@@ -219,10 +219,12 @@ def _keep_body(mended: Repair) -> None:
         inside = _is_inside(mended.vertices, part, shell)
         if inside and held > _CAVITY * volume:
             kept |= piece == other
-        elif not inside and area[other] > _CRUMB * area[body]:
+        elif area[other] > _CRUMB * area[body]:
+            size = f"{len(part):,} triangles and {100 * area[other] / area[body]:.3g} % of the area of the largest"
             raise ValueError(
-                f"the file holds more than one body: the second has {len(part):,} triangles and "
-                f"{100 * area[other] / area[body]:.3g} % of the area of the largest. Export the one that is meant"
+                f"a sheet inside the body encloses nothing: it has {size}. Remove it, or close it into a cavity"
+                if inside
+                else f"the file holds more than one body: the second has {size}. Export the one that is meant"
             )
         else:
             crumbs.append(len(part))

@@ -57,6 +57,12 @@ def with_flap() -> tuple[np.ndarray, np.ndarray]:
     return np.vstack([VERTICES, [[0, 0, 0]]]), np.vstack([TRIANGLES, [[a, b, N]]])
 
 
+def with_sheet_inside() -> tuple[np.ndarray, np.ndarray]:
+    """A square with 15 % of the body's area, through its center."""
+    corners = [[-35.0, -35.0, 0.0], [35.0, -35.0, 0.0], [35.0, 35.0, 0.0], [-35.0, 35.0, 0.0]]
+    return np.vstack([VERTICES, corners]), np.vstack([TRIANGLES, [[N, N + 1, N + 2], [N, N + 2, N + 3]]])
+
+
 def with_fold() -> tuple[np.ndarray, np.ndarray]:
     vertices = VERTICES.copy()
     vertices[100] *= -0.2  # through the body's center, not to the other side
@@ -115,8 +121,9 @@ def test_the_cases_are_mended_and_fill_with_nodes(tmp_path: Path, name: str) -> 
     [
         (lambda: (np.vstack([VERTICES, VERTICES + 200]), np.vstack([TRIANGLES, TRIANGLES + N])), "more than one body"),
         (lambda: (VERTICES, TRIANGLES[VERTICES[TRIANGLES][:, :, 2].mean(axis=1) > 0]), "its 1 holes have 5.* % of its area"),
+        (with_sheet_inside, "a sheet inside the body encloses nothing"),
     ],
-    ids=["two bodies", "half a body"],
+    ids=["two bodies", "half a body", "sheet inside"],
 )  # fmt: skip
 def test_what_can_not_be_mended_is_refused(
     tmp_path: Path, make: Callable[[], tuple[np.ndarray, np.ndarray]], words: str
