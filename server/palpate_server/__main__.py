@@ -141,6 +141,25 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="Zenoh configuration (JSON5), used as it is: TLS, access control, routers",
     )
+    _add_folders(parser)
+    parser.add_argument(
+        "--surface-hz",
+        type=_surface_rate,
+        default=DEFAULT_SURFACE_HZ,
+        metavar="HZ",
+        help=f"surfaces a second while somebody subscribes, up to {MAX_SURFACE_HZ:g} (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--cpu",
+        type=index,
+        metavar="N",
+        help="keep the threads that run ticks on this processor (default: where the system puts them)",
+    )
+    _add_limits(parser.add_argument_group("limits", "what no client can exceed, for each tool"))
+    return parser
+
+
+def _add_folders(parser: argparse.ArgumentParser) -> None:
     for name, text in (
         ("--models", "folder that clients may load other models from (default: that of MODEL.npz)"),
         (
@@ -160,30 +179,18 @@ def _parser() -> argparse.ArgumentParser:
         metavar="GB",
         help="largest size of the folder of recordings (default: %(default)s)",
     )
-    parser.add_argument(
-        "--surface-hz",
-        type=_surface_rate,
-        default=DEFAULT_SURFACE_HZ,
-        metavar="HZ",
-        help=f"surfaces a second while somebody subscribes, up to {MAX_SURFACE_HZ:g} (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--cpu",
-        type=index,
-        metavar="N",
-        help="keep the threads that run ticks on this processor (default: where the system puts them)",
-    )
-    limits = parser.add_argument_group("limits", "what no client can exceed, for each tool")
+
+
+def _add_limits(group: argparse._ArgumentGroup) -> None:
     for name, default, metavar, text in (
         ("--max-force-n", 10.0, "N", ""),
         ("--max-force-rate-n-per-s", 2000.0, "N/S", ""),
         ("--max-speed-m-per-s", 1.0, "M/S", "of a tip "),
         ("--workspace-m", 0.1, "M", "farthest that a tip moves from its start "),
     ):
-        limits.add_argument(
+        group.add_argument(
             name, type=positive, default=default, metavar=metavar, help=f"{text}(default: %(default)s)"
         )
-    return parser
 
 
 def _surface_rate(text: str) -> float:

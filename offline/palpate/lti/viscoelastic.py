@@ -75,20 +75,27 @@ def viscoelastic_system(modes: ElasticModes, prony: PronySeries) -> PoleResidueS
     poles_b = np.where(mirrored[:, None], poles_b.conj(), poles_b)[kept]
     poles_c = np.where(mirrored[:, None], poles_c.conj(), poles_c)[kept]
 
-    left, gains, right = _split(static, symmetric)
-    n_channels = len(gains)
-    memory_poles, memory_b, memory_c = [], [], []
-    for gamma, tau in zip(prony.gamma, prony.tau_s, strict=True):
-        root = np.sqrt(-gamma / tau * gains.astype(np.complex128))
-        memory_poles.append(np.full(n_channels, -1 / tau, dtype=np.complex128))
-        memory_b.append(root[:, None] * right)
-        memory_c.append(root[:, None] * left.T)
+    static_poles, static_b, static_c = _relaxation(static, symmetric, prony)
     return PoleResidueSystem(
-        poles=np.concatenate([*memory_poles, poles]),
-        b=np.concatenate([*memory_b, poles_b]),
-        c=np.ascontiguousarray(np.concatenate([*memory_c, poles_c]).T),
+        poles=np.concatenate([static_poles, poles]),
+        b=np.concatenate([static_b, poles_b]),
+        c=np.ascontiguousarray(np.concatenate([static_c, poles_c]).T),
         d=prony.instant_factor * direct,
-        group=np.concatenate([np.zeros(n_channels * len(memory_poles), dtype=np.int64), group[kept]]),
+        group=np.concatenate([np.zeros(len(static_poles), dtype=np.int64), group[kept]]),
+    )
+
+
+def _relaxation(static: Array, symmetric: bool, prony: PronySeries) -> tuple[Complex, Complex, Complex]:
+    """Poles (n,), 1/s, and rows b, c (n, n_channels) of the relaxation of the static stiffness, branch by branch."""
+    left, gains, right = _split(static, symmetric)
+    gamma_over_tau = np.divide(prony.gamma, prony.tau_s)
+    roots = np.sqrt(-gamma_over_tau[:, None] * gains.astype(np.complex128)).ravel()
+    poles = np.repeat(-1 / np.asarray(prony.tau_s, dtype=np.complex128), len(gains))
+    n_branches = len(prony.tau_s)
+    return (
+        poles,
+        roots[:, None] * np.tile(right, (n_branches, 1)),
+        roots[:, None] * np.tile(left.T, (n_branches, 1)),
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -237,106 +238,135 @@ def _in_real_coordinates(system: PoleResidueSystem, rows: NDArray[np.complex128]
     return out
 
 
+class _Pivot(NamedTuple):
+    """A pole's block of the Gramian, its eigenvectors and the rows of the generator that its columns eliminate.
+
+    pole                  lambda of the block
+    is_pair               whether a conjugate pole belongs to it: then it is 2 by 2
+    direction, second     (m,), the rows: that of the pole, and that of its conjugate once the first is eliminated
+    length2, second2      squares of their norms; second2 is 0 where there is no second
+    product               conj(direction) conj(direction)^T, what couples the pole to its conjugate
+    cosine, sine          of the angle of the block's eigenvectors
+    first_scale, second_scale  1/sqrt of its eigenvalues; second_scale is 0 where the block gives one column only
+    """
+
+    pole: complex
+    is_pair: bool
+    direction: NDArray[np.complex128]
+    second: NDArray[np.complex128]
+    length2: float
+    second2: float
+    product: complex
+    cosine: float
+    sine: float
+    first_scale: float
+    second_scale: float
+
+
 @njit(cache=True)
 def _eliminate(poles, is_pair, start, generator, diagonal, target, columns):  # type: ignore[no-untyped-def]
     """Fill `columns` with Cholesky columns, largest remaining diagonal block first, updating generator and diagonal.
 
     Returns (number of columns filled, remaining trace); stops at the target or when no pair of columns fits.
     """
-    n, m = generator.shape
-    direction = np.empty(m, dtype=np.complex128)
-    second = np.empty(m, dtype=np.complex128)
     count = 0
     residual = diagonal.sum()
     while residual > target and count + 2 <= columns.shape[0]:
         j = np.argmax(diagonal)
-        pivot = poles[j]
-        a = pivot.real
-        length2 = 0.0
-        product = 0j  # conj(b_j) conj(b_j)^T, what couples the pivot to its conjugate
-        for i in range(m):
-            direction[i] = generator[j, i]
-            length2 += direction[i].real ** 2 + direction[i].imag ** 2
-            product += np.conj(direction[i]) ** 2
-        if length2 == 0.0:
+        pivot = _pivot(poles[j], is_pair[j], generator[j].copy())
+        if pivot.length2 == 0.0:
             break
-        p = -length2 / (2 * a)
-
-        if is_pair[j]:
-            # The pivot block [[p + Re q, Im q], [Im q, p - Re q]] has eigenvalues p +- |q|.
-            q = -np.conj(product) / (2 * pivot)
-            angle = 0.5 * np.arctan2(q.imag, q.real)
-            cosine, sine = np.cos(angle), np.sin(angle)
-            large, small = p + abs(q), p - abs(q)
-            factor = 2 * a / (2 * np.conj(pivot) * length2)
-            second2 = 0.0
-            for i in range(m):
-                second[i] = np.conj(direction[i]) - factor * product * direction[i]
-                second2 += second[i].real ** 2 + second[i].imag ** 2
-            two = small > 1e-14 * large and second2 > 0.0
-            first_scale = 1 / np.sqrt(large)
-            second_scale = 1 / np.sqrt(small) if two else 0.0
-        else:
-            two = False
-            first_scale = 1 / np.sqrt(p)
-
-        residual = 0.0
-        for k in range(n):
-            if k == j:
-                inner = length2 + 0j
-                cross = np.conj(product)
-            else:
-                inner = 0j
-                cross = 0j
-                for i in range(m):
-                    inner += generator[k, i] * np.conj(direction[i])
-                    cross += generator[k, i] * direction[i]
-            inverse = 1 / (poles[k] + np.conj(pivot))
-            s = -inner * inverse
-            row = start[k]
-            if is_pair[j]:
-                mirror = 1 / (poles[k] + pivot)
-                t = -cross * mirror
-                if is_pair[k]:
-                    xx, xy = s.real + t.real, t.imag - s.imag
-                    yx, yy = s.imag + t.imag, s.real - t.real
-                    columns[count, row] = (xx * cosine + xy * sine) * first_scale
-                    columns[count, row + 1] = (yx * cosine + yy * sine) * first_scale
-                    if two:
-                        columns[count + 1, row] = (-xx * sine + xy * cosine) * second_scale
-                        columns[count + 1, row + 1] = (-yx * sine + yy * cosine) * second_scale
-                else:
-                    x, y = np.sqrt(2.0) * s.real, -np.sqrt(2.0) * s.imag
-                    columns[count, row] = (x * cosine + y * sine) * first_scale
-                    if two:
-                        columns[count + 1, row] = (-x * sine + y * cosine) * second_scale
-            elif is_pair[k]:
-                columns[count, row] = np.sqrt(2.0) * s.real * first_scale
-                columns[count, row + 1] = np.sqrt(2.0) * s.imag * first_scale
-            else:
-                columns[count, row] = s.real * first_scale
-
-            if k == j:
-                for i in range(m):
-                    generator[k, i] = 0j
-                diagonal[k] = 0.0
-                continue
-            scale = 2 * a * inverse * inner / length2
-            for i in range(m):
-                generator[k, i] -= scale * direction[i]
-            if is_pair[j] and second2 > 0.0:
-                inner = 0j
-                for i in range(m):
-                    inner += generator[k, i] * np.conj(second[i])
-                scale = 2 * a * mirror * inner / second2
-                for i in range(m):
-                    generator[k, i] -= scale * second[i]
-            left = 0.0
-            for i in range(m):
-                if not is_pair[k]:
-                    generator[k, i] = generator[k, i].real + 0j
-                left += generator[k, i].real ** 2 + generator[k, i].imag ** 2
-            diagonal[k] = -left / (2 * poles[k].real) * (2 if is_pair[k] else 1)
-            residual += diagonal[k]
-        count += 2 if two else 1
+        residual = _column(poles, is_pair, start, generator, diagonal, pivot, columns[count : count + 2])
+        generator[j] = 0j
+        residual -= diagonal[j]
+        diagonal[j] = 0.0
+        count += 2 if pivot.second_scale > 0.0 else 1
     return count, residual
+
+
+@njit(cache=True)
+def _pivot(pole, is_pair, direction):  # type: ignore[no-untyped-def]
+    """The pivot of a pole with the row `direction` (m,) of the generator."""
+    a = pole.real
+    length2, product = 0.0, 0j
+    for b in direction:
+        length2 += b.real**2 + b.imag**2
+        product += np.conj(b) ** 2
+    second = np.zeros_like(direction)
+    p = -length2 / (2 * a)
+    if not is_pair or length2 == 0.0:
+        scale = 1 / np.sqrt(p) if length2 > 0.0 else 0.0
+        return _Pivot(pole, is_pair, direction, second, length2, 0.0, product, 1.0, 0.0, scale, 0.0)
+    # The block [[p + Re q, Im q], [Im q, p - Re q]] has eigenvalues p +- |q|.
+    q = -np.conj(product) / (2 * pole)
+    angle = 0.5 * np.arctan2(q.imag, q.real)
+    large, small = p + abs(q), p - abs(q)
+    factor = 2 * a / (2 * np.conj(pole) * length2)
+    second2 = 0.0
+    for i, b in enumerate(direction):
+        second[i] = np.conj(b) - factor * product * b
+        second2 += second[i].real ** 2 + second[i].imag ** 2
+    second_scale = 1 / np.sqrt(small) if small > 1e-14 * large and second2 > 0.0 else 0.0
+    return _Pivot(
+        pole, is_pair, direction, second, length2, second2, product,
+        np.cos(angle), np.sin(angle), 1 / np.sqrt(large), second_scale,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _column(poles, is_pair, start, generator, diagonal, pivot, columns):  # type: ignore[no-untyped-def]
+    """Fill the pivot's columns (2, n_states) and take it from generator and diagonal. Returns the diagonal's sum.
+
+    The pivot's own row is left as round-off makes it: the caller clears it.
+    """
+    a, direction, second = pivot.pole.real, pivot.direction, pivot.second
+    cosine, sine, two = pivot.cosine, pivot.sine, pivot.second_scale > 0.0
+    total = 0.0
+    for k in range(len(poles)):
+        inner, cross = 0j, 0j
+        for i in range(len(direction)):
+            inner += generator[k, i] * np.conj(direction[i])
+            cross += generator[k, i] * direction[i]
+        inverse = 1 / (poles[k] + np.conj(pivot.pole))
+        s = -inner * inverse
+        mirror, t = 0j, 0j
+        if pivot.is_pair:
+            mirror = 1 / (poles[k] + pivot.pole)
+            t = -cross * mirror
+        # The pole's rows, one or two, in the pivot's two states x and y; a real pivot has only x.
+        first_x, first_y, second_x, second_y = (
+            s.real + t.real,
+            t.imag - s.imag,
+            s.imag + t.imag,
+            s.real - t.real,
+        )
+        if pivot.is_pair != is_pair[k]:
+            first_x, first_y = np.sqrt(2.0) * s.real, -np.sqrt(2.0) * s.imag
+            second_x = np.sqrt(2.0) * s.imag
+        row = start[k]
+        columns[0, row] = (first_x * cosine + first_y * sine) * pivot.first_scale
+        if is_pair[k]:
+            columns[0, row + 1] = (second_x * cosine + second_y * sine) * pivot.first_scale
+        if two:
+            columns[1, row] = (-first_x * sine + first_y * cosine) * pivot.second_scale
+            if is_pair[k]:
+                columns[1, row + 1] = (-second_x * sine + second_y * cosine) * pivot.second_scale
+
+        scale = 2 * a * inverse * inner / pivot.length2
+        for i in range(len(direction)):
+            generator[k, i] -= scale * direction[i]
+        if pivot.second2 > 0.0:
+            inner = 0j
+            for i in range(len(direction)):
+                inner += generator[k, i] * np.conj(second[i])
+            scale = 2 * a * mirror * inner / pivot.second2
+            for i in range(len(direction)):
+                generator[k, i] -= scale * second[i]
+        left = 0.0
+        for i in range(len(direction)):
+            if not is_pair[k]:
+                generator[k, i] = generator[k, i].real + 0j
+            left += generator[k, i].real ** 2 + generator[k, i].imag ** 2
+        diagonal[k] = -left / (2 * poles[k].real) * (2 if is_pair[k] else 1)
+        total += diagonal[k]
+    return total

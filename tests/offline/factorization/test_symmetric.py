@@ -82,33 +82,28 @@ def test_a_nearly_singular_matrix_gives_a_solution_with_a_small_residual(solver)
     assert np.all(residual <= 1e-13 * (norm * np.abs(solution).sum(axis=0) + np.abs(right).sum(axis=0)))
 
 
-def test_a_solution_that_refinement_cannot_save_is_an_error_with_the_number(monkeypatch):
-    matrix = _laplacian(5)
-    factor = factorize(matrix)
+def _solutions_times(scale, factor, monkeypatch):
+    """The factor with a solver whose solutions are wrong by a constant."""
     exact = factor._backend
 
-    class Broken:
+    class Wrong:
         nnz, n_negative = exact.nnz, exact.n_negative
 
         def solve(self, right):
-            return 3 * exact.solve(right)  # refinement diverges: each step doubles the error
+            return scale * exact.solve(right)
 
-    monkeypatch.setattr(factor, "_backend", Broken())
+    monkeypatch.setattr(factor, "_backend", Wrong())
+    return factor
+
+
+def test_a_solution_that_refinement_cannot_save_is_an_error_with_the_number(monkeypatch):
+    factor = _solutions_times(3, factorize(_laplacian(5)), monkeypatch)  # each step doubles the error
     with pytest.raises(np.linalg.LinAlgError, match=r"backward error of a solution is \d"):
         factor.solve(np.ones(125))
 
 
 def test_an_inexact_factor_is_refined(monkeypatch):
     matrix = _laplacian(5)
-    factor = factorize(matrix)
-    exact = factor._backend
-
-    class Rough:
-        nnz, n_negative = exact.nnz, exact.n_negative
-
-        def solve(self, right):
-            return (1 + 1e-6) * exact.solve(right)
-
-    monkeypatch.setattr(factor, "_backend", Rough())
+    factor = _solutions_times(1 + 1e-6, factorize(matrix), monkeypatch)
     right = np.random.default_rng(4).standard_normal((125, 3))
     np.testing.assert_allclose(factor.solve(right), np.linalg.solve(matrix.toarray(), right), atol=1e-13)
