@@ -20,13 +20,13 @@ from palpate.lti.errors import ReductionError
 from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.lti.sampling import Sampling
 from palpate.lti.viscoelastic import viscoelastic_system
-from palpate.model_file import Contact, ReducedModel, StateSpace, Surface
+from palpate.model_file import Contact, ReducedModel, Surface
 from palpate.modes.body_modes import body_modes, by_ritz, require_memory
 from palpate.modes.elastic_modes import ElasticModes
 from palpate.progress import NO_PROGRESS, Progress
 from palpate.reduction.accuracy import measure, refuse_meaningless
 from palpate.reduction.methods import Reduction, reduce
-from palpate.reduction.passive import passive
+from palpate.reduction.passive import RitzSubspace, passive
 from palpate.reduction.surface import fit_surface_output
 from palpate.scene.material import Material
 from palpate.scene.plausibility import plausibility
@@ -36,6 +36,21 @@ from palpate.scene_cloud import build_cloud, contact_patches, fixed_nodes, shown
 Array = NDArray[np.float64]
 
 _ASSEMBLE = {"conservative": conservative.assemble, "collocation": collocation.assemble}
+
+
+@dataclass(frozen=True)
+class ShownSurface:
+    """The surface that a client draws, and what its displacement is made of.
+
+    vertices (n, 3), m, triangles (n_triangles, 3)
+    shapes        (3 n, n_modes), the displacements of the modes
+    patch_shapes  (3 n, n_inputs), those of the patch displacements
+    """
+
+    vertices: Array
+    triangles: NDArray[np.int32]
+    shapes: NDArray[np.float64] | NDArray[np.complex128]
+    patch_shapes: Array
 
 
 @dataclass(frozen=True)
@@ -151,32 +166,44 @@ def _reduce_with_surface(
     Where a tolerance chooses the order, it is tightened until the surface keeps to its own, or the method has no more.
     """
     wanted = config.reduction
-    reduction, running = _reduce(full, wanted, wanted.tolerance, progress)
-    surface, error = _surface(full, to_block_form(running), config, progress)
+    progress("surface")
+    shown = _shown(full, config)
+    progress.note(f"{len(shown.vertices):,} vertices")
+    subspace = None
+    if wanted.method == "passive":
+        progress("Krylov subspace")
+        subspace = RitzSubspace.of(full.modes)
+    reduction, running = _reduce(full, subspace, wanted, wanted.tolerance, progress)
+    surface, error = _surface(full, shown, running, wanted, progress)
     tolerance = wanted.tolerance
     while tolerance is not None and error > wanted.tolerance_surface:
         tolerance /= 3
         try:
-            reduction, running = _reduce(full, wanted, tolerance, progress)
+            reduction, running = _reduce(full, subspace, wanted, tolerance, progress)
         except ReductionError:
             progress.warn(
                 f"the surface is wrong by {100 * error:.2g} %, reduction.tolerance_surface is "
                 f"{100 * wanted.tolerance_surface:.2g} %: {wanted.method} comes no nearer"
             )
             break
-        surface, error = _surface(full, to_block_form(running), config, progress)
+        surface, error = _surface(full, shown, running, wanted, progress)
     return reduction, running, surface, error
 
 
 def _reduce(
-    full: FullModel, wanted: ReductionTable, tolerance: float | None, progress: Progress
+    full: FullModel,
+    subspace: RitzSubspace | None,
+    wanted: ReductionTable,
+    tolerance: float | None,
+    progress: Progress,
 ) -> tuple[Reduction, PoleResidueSystem]:
-    """The reduced system, and the same sampled."""
+    """The reduced system, and the same sampled. The subspace is that of the method "passive"."""
     progress(f"reduction, {wanted.method}")
     sampling = Sampling(wanted.period_s, wanted.sampling, wanted.band_hz)
     if wanted.method == "passive":
+        assert subspace is not None
         reduction = passive(
-            full.system, full.modes, full.material.prony, sampling, order=wanted.order, tolerance=tolerance
+            full.system, subspace, full.material.prony, sampling, order=wanted.order, tolerance=tolerance
         )
     else:
         reduction = reduce(
@@ -191,22 +218,35 @@ def _reduce(
     return reduction, sampling.sample(reduction.system)
 
 
-def _surface(
-    full: FullModel, discrete: StateSpace, config: Config, progress: Progress
-) -> tuple[Surface, float]:
-    """The surface that is shown with its read-out of the discrete model, and its error in the band, a fraction."""
-    progress("surface")
+def _shown(full: FullModel, config: Config) -> ShownSurface:
     shown, basis = shown_surface(config, full.cloud), full.body.basis
+    return ShownSurface(
+        shown.vertices,
+        shown.triangles,
+        basis.values_at(shown.vertices, full.modes.parameters),
+        basis.values_at(shown.vertices, full.modes.patch_parameters),
+    )
+
+
+def _surface(
+    full: FullModel,
+    shown: ShownSurface,
+    running: PoleResidueSystem,
+    wanted: ReductionTable,
+    progress: Progress,
+) -> tuple[Surface, float]:
+    """The surface with its read-out of the sampled model, and its error in the band, a fraction."""
+    progress("surface read-out")
     fitted = fit_surface_output(
         full.modes,
         full.material.prony,
-        basis.values_at(shown.vertices, full.modes.parameters),
-        basis.values_at(shown.vertices, full.modes.patch_parameters),
-        discrete,
-        period_s=config.reduction.period_s,
-        band_hz=config.reduction.band_hz,
+        shown.shapes,
+        shown.patch_shapes,
+        to_block_form(running),
+        period_s=wanted.period_s,
+        band_hz=wanted.band_hz,
     )
-    progress.note(f"{len(shown.vertices):,} vertices")
+    progress.note(f"error in band {100 * fitted.error_in_band:.2g} %")
     surface = Surface(shown.vertices, shown.triangles, fitted.output, fitted.feedthrough)
     return surface, fitted.error_in_band
 

@@ -5,16 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from palpate.model_file import Contact, ReducedModel
+from palpate.model_file.advice import NOTABLE_ERROR, force_advice, percent
 
 GOOD_ERROR = 0.05  # below what a hand tells apart: from about 7 % of a force (Pang, Tan & Durlach 1991)
-NOTABLE_ERROR = 0.1  # above this a model is not what it was built for
 
 Rows = list[tuple[str, str, str]]
-
-
-def percent(fraction: float) -> str:
-    """A relative error in percent with two significant digits, three from 100 % up."""
-    return f"{100 * fraction:.2g} %" if fraction < 0.995 else f"{100 * fraction:.0f} %"
 
 
 def accuracy_text(model: ReducedModel, verbose: bool = False) -> str:
@@ -31,21 +26,8 @@ def accuracy_text(model: ReducedModel, verbose: bool = False) -> str:
 
 
 def advice(model: ReducedModel) -> list[str]:
-    """What to change where an error is notable, a sentence each; empty for a good model. Never advises the method in use."""
-    accuracy, found = model.accuracy, []
-    low, high = accuracy.band_hz
-    for error, where in (
-        (accuracy.error_in_band, f"in {low:g}-{high:g} Hz"),
-        (accuracy.error_static, "at rest"),
-    ):
-        if error > NOTABLE_ERROR:
-            other = "" if model.method == "tbr-band" else " or use tbr-band"
-            zero = " A model that always answers zero is wrong by 100 %." if error > 1 else ""
-            found.append(f"Force {where}: wrong by {percent(error)}; raise the order{other}.{zero}")
-    if accuracy.error_step > max(NOTABLE_ERROR, 2 * accuracy.error_static):
-        found.append(
-            "After a jump: the body rings near half the sampling rate; give the material a branch of short tau_s."
-        )
+    """What to change where an error is notable, a sentence each; empty for a good model."""
+    accuracy, found = model.accuracy, force_advice(model)
     if model.continuous.n_padding:
         found.append(
             f"Order {model.order - 1} is stored as {model.order}: states come in pairs, one is padding."
@@ -124,7 +106,7 @@ def _figures(model: ReducedModel) -> Rows:
         ("full model converged", "all modes" if accuracy.change_over_last_vectors == 0 else percent(accuracy.change_over_last_vectors), "change of its force in the band by its last vectors"),
         ("error, H-infinity", percent(accuracy.error_hinf), "largest over all frequencies, of the largest response; far above the band it may be 100 %"),
         ("bound, H-infinity", bound, "what the method guarantees beforehand"),
-        ("spectral abscissa", f"{accuracy.spectral_abscissa:.3g} 1/s", "of the slowest state; below 0 is stable"),
+        ("spectral abscissa", f"{accuracy.spectral_abscissa:.3g} 1/s", f"of the slowest state, the full model's is {accuracy.spectral_abscissa_full:.3g} 1/s; below 0 is stable"),
         ("passivity margin", f"{accuracy.passivity_margin:.2g}", "dissipation over static stiffness, smallest; below 0 can give out energy"),
         ("passive up to", f"{accuracy.passive_up_to_hz:.3g} Hz", "no slower sinusoidal motion gets energy out"),
         ("energy given out", f"{accuracy.largest_energy_out_j:.2g} J", "at most, in one closed motion of 1 mm"),

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from palpate.lti.block_form import diagonalize
 from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.reduction import Reduction, ReductionError, reduce
-from palpate.reduction.methods import Method as ReductionMethod
 from palpate.reduction.methods import balanced
+from palpate.scene.quantities import SystemMethod
 
 Band = tuple[float, float]
 Apply = Callable[[PoleResidueSystem, Band, int], Reduction]
@@ -74,7 +74,7 @@ def singular_perturbation_balancing(system: PoleResidueSystem, order: int) -> Re
     return Reduction("singular-perturbation", reduced, balancing.sigma, 2 * balancing.tail(r))
 
 
-def _by(method: ReductionMethod) -> Apply:
+def _by(method: SystemMethod) -> Apply:
     return lambda system, band, order: reduce(system, method, order=order, band_hz=band)
 
 

@@ -2,13 +2,12 @@
 
 from palpate.lti.errors import ReductionError
 from palpate.reduction.accuracy import measure
-from palpate.reduction.methods import METHODS, Method, Reduction, reduce, reductions
+from palpate.reduction.methods import METHODS, Reduction, reduce, reductions
 from palpate.reduction.passive import passive
 from palpate.reduction.surface import SurfaceOutput, fit_surface_output
 
 __all__ = [
     "METHODS",
-    "Method",
     "Reduction",
     "ReductionError",
     "SurfaceOutput",

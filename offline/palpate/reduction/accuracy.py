@@ -17,6 +17,7 @@ from palpate.lti.frequencies import (
 from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.lti.stepping import step_through
 from palpate.model_file import AccuracyReport
+from palpate.model_file.advice import what_to_change
 from palpate.reduction.methods import Reduction
 from palpate.reduction.passivity import largest_energy_out, passive_up_to, passivity_margin
 
@@ -180,12 +181,8 @@ def refuse_meaningless(accuracy: AccuracyReport, method: str) -> None:
         if not error <= _MEANINGLESS_ERROR:
             raise ReductionError(
                 f"the reduced model's force is wrong by {100 * error:.3g} % {where}, expected at most "
-                f"{100 * _MEANINGLESS_ERROR:.0f} %: {_advice(method)}, or check the material's constants"
+                f"{100 * _MEANINGLESS_ERROR:.0f} %: {what_to_change(method)}, or check the material's constants"
             )
-
-
-def _advice(method: str) -> str:
-    return "raise the order" if method == "tbr-band" else "raise the order or use tbr-band"
 
 
 def _smooth_step(x: Array) -> Array:

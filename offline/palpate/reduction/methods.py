@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,9 @@ from palpate.reduction.balancing import Balancing, balance
 from palpate.reduction.gramians import Gramians, band_controllability_factor, gramians, real_form
 from palpate.reduction.hankel_optimal import hankel_optimal, hankel_optimal_bound, hankel_optimal_orders
 from palpate.reduction.search import smallest_order
+from palpate.scene.quantities import SystemMethod
 
-Method = Literal["tbr", "tbr-band", "hankel-optimal", "modal", "modal-static"]
-METHODS: tuple[Method, ...] = get_args(Method)
+METHODS: tuple[SystemMethod, ...] = get_args(SystemMethod)
 
 Array = NDArray[np.float64]
 Response = Callable[[PoleResidueSystem, Array], NDArray[np.complex128]]
@@ -68,7 +68,7 @@ class Family:
 
 def reduce(
     system: PoleResidueSystem,
-    method: Method,
+    method: SystemMethod,
     *,
     order: int | None = None,
     tolerance: float | None = None,
@@ -126,7 +126,7 @@ def reduce(
 
 
 def reductions(
-    system: PoleResidueSystem, method: Method, band_hz: tuple[float, float] = (0.0, 30.0)
+    system: PoleResidueSystem, method: SystemMethod, band_hz: tuple[float, float] = (0.0, 30.0)
 ) -> Family:
     """The reduced systems of a method at every order it has; arguments and errors as in `reduce`."""
     if method not in METHODS:
@@ -185,7 +185,9 @@ def check_stability(system: PoleResidueSystem) -> None:
         )
 
 
-def _check_bound(full: PoleResidueSystem, reduced: PoleResidueSystem, method: Method, bound: float) -> None:
+def _check_bound(
+    full: PoleResidueSystem, reduced: PoleResidueSystem, method: SystemMethod, bound: float
+) -> None:
     """At the resonances of very lightly damped poles, where round-off may break it; bounds are those of exact arithmetic."""
     poles = np.concatenate([full.poles, reduced.poles])
     narrow = poles[(poles.imag > 0) & (-poles.real < _LIGHTLY_DAMPED * poles.imag)]
@@ -201,7 +203,7 @@ def _check_bound(full: PoleResidueSystem, reduced: PoleResidueSystem, method: Me
         )
 
 
-def _gramians(system: PoleResidueSystem, method: Method, band_hz: tuple[float, float]) -> Gramians:
+def _gramians(system: PoleResidueSystem, method: SystemMethod, band_hz: tuple[float, float]) -> Gramians:
     whole = gramians(system)
     if method != "tbr-band":
         return whole

@@ -81,7 +81,7 @@ class _Target:
 
 def passive(
     full: PoleResidueSystem,
-    modes: ElasticModes,
+    subspace: RitzSubspace,
     prony: PronySeries,
     sampling: Sampling,
     *,
@@ -90,23 +90,16 @@ def passive(
 ) -> Reduction:
     """The passive model of at most `order` states, or one that keeps the error in the band; see the module's text.
 
-    full       the viscoelastic system of the modes
-    modes      all modes of a symmetric body, or so many that they are true to half the sampling rate
+    full       the viscoelastic system of the modes that the subspace is made of
+    subspace   of the body; the same for every order and tolerance
     tolerance  largest over the band of |F - F_reduced| / |F|, F_reduced once sampled, a fraction
     Exactly one of order and tolerance is given.
 
-    Raises ReductionError where the body is not symmetric, where the order is too small for the static stiffness, or
-    where the tolerance is not reached.
+    Raises ReductionError where the order is too small for the static stiffness, or where the tolerance is not reached.
     """
-    if not (
-        np.isrealobj(modes.squared_frequencies)
-        and np.array_equal(modes.output_coupling, modes.input_coupling.T)
-    ):
-        raise ReductionError("passive needs a symmetric body: discretize by conservative, or use tbr-band")
     if (order is None) == (tolerance is None):
         raise ValueError(f"order = {order} and tolerance = {tolerance}: expected exactly one of them")
     check_stability(full)
-    subspace = RitzSubspace.of(modes)
     if order is not None:
         system = _of_order(order, full, subspace, prony, sampling)
     else:
@@ -130,7 +123,19 @@ class RitzSubspace:
 
     @classmethod
     def of(cls, modes: ElasticModes, most_blocks: int = _MOST_BLOCKS) -> RitzSubspace:
-        """Blocks until the space is exhausted, at most `most_blocks`."""
+        """Blocks until the space is exhausted, at most `most_blocks`.
+
+        modes  all modes of a symmetric body, or so many that they are true to half the sampling rate
+
+        Raises ReductionError where the body is not symmetric.
+        """
+        if not (
+            np.isrealobj(modes.squared_frequencies)
+            and np.array_equal(modes.output_coupling, modes.input_coupling.T)
+        ):
+            raise ReductionError(
+                "passive needs a symmetric body: discretize by conservative, or use tbr-band"
+            )
         mu, b = np.real(modes.squared_frequencies), np.real(modes.input_coupling)
         basis = np.zeros((len(mu), 0))
         block = b / mu[:, None]

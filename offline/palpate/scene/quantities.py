@@ -19,6 +19,11 @@ SHORTEST_M, LONGEST_M = 1e-6, 1e4
 MAX_NODES = 200_000
 """More nodes than this are a slip in a unit."""
 
+SystemMethod = Literal["tbr", "tbr-band", "hankel-optimal", "modal", "modal-static"]
+"""Reductions of any stable linear system."""
+ReductionMethod = Literal["passive", SystemMethod]
+"""All reductions: "passive" needs the modes of a symmetric body."""
+
 LengthUnit = Literal["m", "cm", "mm"]
 UNITS_M: dict[LengthUnit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """The units that a surface file may be in, each with its length, m."""

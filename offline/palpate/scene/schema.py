@@ -13,10 +13,18 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator, mo
 
 from palpate.model_file import LONGEST_PERIOD_S, SHORTEST_PERIOD_S
 from palpate.scene.material import PRESETS, Material, PronySeries, check_constant
-from palpate.scene.quantities import MAX_NODES, SHORTEST_M, Count, Length, LengthUnit, Number, Point, Table
+from palpate.scene.quantities import (
+    MAX_NODES,
+    SHORTEST_M,
+    Count,
+    Length,
+    LengthUnit,
+    Number,
+    Point,
+    ReductionMethod,
+    Table,
+)
 from palpate.scene.regions import Region
-
-ReductionMethod = Literal["passive", "tbr", "tbr-band", "hankel-optimal", "modal", "modal-static"]
 
 _SHORTEST_TAU_IN_PERIODS = 0.01
 """A faster branch acts as a damper, and its terms are lost in round-off."""

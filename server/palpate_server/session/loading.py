@@ -9,6 +9,7 @@ from typing import Any
 
 from palpate.files import LONGEST_NAME_BYTES, is_plain_name
 from palpate.model_file import ModelFileError
+from palpate.model_file.advice import force_advice
 from palpate_server.coupling import cross_fade, models
 from palpate_server.coupling.models import Model
 from palpate_server.errors import Refused
@@ -22,7 +23,6 @@ from palpate_server.session.state import SessionState
 log = logging.getLogger("palpate_server")
 
 CROSS_FADE_S = 0.5  # from one model to another
-TOLERABLE_ERROR = 0.1  # of the force in the band; people notice a difference of about 7 % (Jones 1989)
 
 
 class ModelLoader:
@@ -105,13 +105,7 @@ class ModelLoader:
 
 def accuracy_warnings(model: Model) -> list[str]:
     """Warnings that follow from a model's own accuracy report; empty for a good one."""
-    error, (low, high) = model.accuracy.error_in_band, model.accuracy.band_hz
-    if error <= TOLERABLE_ERROR:
-        return []
-    return [
-        f"the force of the model {model.name!r} is wrong by up to {100 * error:.3g} % from {low:g} to {high:g} Hz "
-        "(error_in_band of its accuracy report)"
-    ]
+    return [f"model {model.name!r}: {text}" for text in force_advice(model)]
 
 
 def warnings_of(state: SessionState, tools: Iterable[str]) -> list[str]:

@@ -41,7 +41,7 @@ def body(request):
 @pytest.fixture(scope="module")
 def reduced(body):
     modes, full = body
-    return passive(full, modes, TISSUE.prony, SAMPLING, tolerance=0.01).system
+    return passive(full, RitzSubspace.of(modes), TISSUE.prony, SAMPLING, tolerance=0.01).system
 
 
 def dissipation(responses):
@@ -132,7 +132,7 @@ def test_an_order_is_not_exceeded_and_more_states_bring_it_nearer(body):
     omega = band_frequencies((full,), SAMPLING.band_hz)
     errors = []
     for order in (130, 400):
-        system = passive(full, modes, TISSUE.prony, SAMPLING, order=order).system
+        system = passive(full, RitzSubspace.of(modes), TISSUE.prony, SAMPLING, order=order).system
         assert system.n_states <= order
         errors.append(np.max(relative_errors(full.transfer(1j * omega), SAMPLING.response(system, omega))))
     assert errors[1] < errors[0] / 2
@@ -141,9 +141,9 @@ def test_an_order_is_not_exceeded_and_more_states_bring_it_nearer(body):
 def test_what_can_not_be_done_is_said(body):
     modes, full = body
     with pytest.raises(ReductionError, match=r"order = 2: passive needs at least [0-9]+ states"):
-        passive(full, modes, TISSUE.prony, SAMPLING, order=2)
+        passive(full, RitzSubspace.of(modes), TISSUE.prony, SAMPLING, order=2)
     with pytest.raises(ReductionError, match=r"tolerance = 1e-12: passive reaches .* in 0-30 Hz at best"):
-        passive(full, modes, TISSUE.prony, SAMPLING, tolerance=1e-12)
+        passive(full, RitzSubspace.of(modes), TISSUE.prony, SAMPLING, tolerance=1e-12)
     skewed = dataclasses.replace(modes, output_coupling=2 * modes.output_coupling)
     with pytest.raises(ReductionError, match="symmetric body"):
-        passive(full, skewed, TISSUE.prony, SAMPLING, tolerance=0.01)
+        RitzSubspace.of(skewed)
