@@ -56,13 +56,29 @@ def command(
     write(memory, 0, sequence, now_ns(memory) - age_ns, target)
 
 
+@pytest.fixture(autouse=True)
+def images() -> Iterator[None]:
+    yield
+    IMAGES.clear()
+
+
+IMAGES: dict[int, tuple[shared_memory.Memory, Image]] = {}
+
+
+def image_of(memory: shared_memory.Memory) -> Image:
+    """It takes five milliseconds to make, so a test makes it once."""
+    if id(memory) not in IMAGES:
+        IMAGES[id(memory)] = memory, make_image(memory)  # with the memory, so that its id is not given again
+    return IMAGES[id(memory)][1]
+
+
 def repeat_tick(image: Image, now: int) -> None:
     scheduler.repeat_tick(image, now, now, False)
 
 
 def tick(memory: shared_memory.Memory) -> tuple[int, np.ndarray, np.ndarray, float]:
     """Run one tick; its flags, applied position, force and scale."""
-    repeat_tick(make_image(memory), now_ns(memory))
+    repeat_tick(image_of(memory), now_ns(memory))
     port = newest(memory)[0]
     return int(port["flags"]), port["position_m"].copy(), port["force_n"].copy(), float(port["force_scale"])
 
@@ -245,7 +261,7 @@ def test_commands_and_forces_are_in_the_holders_frame(
     system = make_spring_mass_model().discrete
     rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     scale, origin = 2.0, np.array([0.1, 0.0, 0.0])
-    scheduler.set_frame(make_image(memory), 0, rotation, scale, origin)
+    scheduler.set_frame(image_of(memory), 0, rotation, scale, origin)
     state = np.zeros(system.order)
     for i in range(300):
         position = origin + 1e-3 * np.sin(0.1 * i) * np.array([1.0, 0.5, -0.2])
@@ -273,7 +289,7 @@ def spring() -> shared_memory.Memory:
 
 def hand_over(memory: shared_memory.Memory, scale: float, origin: tuple[float, float, float]) -> None:
     """What acquiring does: silence, then the next holder's frame."""
-    image = make_image(memory)
+    image = image_of(memory)
     scheduler.forget_command(memory.commands, 0)
     for _ in range(60):
         if scheduler.is_silent(image, 0):
@@ -333,7 +349,7 @@ def test_a_reset_puts_the_tip_to_rest_and_takes_the_force_down_at_the_allowed_ra
         command(spring, i, (0.0, 0.0, 0.05))
         _, _, before, _ = tick(spring)
     assert np.linalg.norm(before) == pytest.approx(USUAL.max_force_n)
-    scheduler.reset(make_image(spring))
+    scheduler.reset(image_of(spring))
     command(spring, 299, (0.0, 0.0, 0.05))
     _, _, before, _ = tick(spring)
     assert spring.ports["energy_j"][0] == 0  # the device has not moved
@@ -353,7 +369,7 @@ def test_the_slowest_allowed_rate_lets_every_force_fade_in_time_and_stale_means_
     spring: shared_memory.Memory, soft_start_ticks: int, lowered_to_n: float
 ) -> None:
     """The model's force is far above the largest one, so that it stands at its limit while its scale already falls."""
-    image = make_image(spring)
+    image = image_of(spring)
     for i in range(soft_start_ticks):
         command(spring, i, (0.0, 0.0, 0.1))
         _, _, before, _ = tick(spring)
@@ -471,7 +487,7 @@ def test_a_command_of_a_hold_that_is_over_is_not_carried_out(memory: shared_memo
 
 
 def test_a_change_that_is_withdrawn_is_not_made(memory: shared_memory.Memory) -> None:
-    image = make_image(memory)
+    image = image_of(memory)
     scheduler.set_limits(image, 0, np.full(5, 2.0))
     assert scheduler.withdraw_change(image)
     tick(memory)
@@ -503,11 +519,11 @@ def test_reset_puts_the_model_to_rest_and_lets_the_force_fade_in_again(
         command(memory, i, (0.0, 0.0, 1e-3))
         tick(memory)
     assert np.any(memory.coupling.running.patch.body.state)
-    scheduler.reset(make_image(memory))
-    assert not scheduler.is_changed(make_image(memory))
+    scheduler.reset(image_of(memory))
+    assert not scheduler.is_changed(image_of(memory))
     command(memory, 250, (0.0, 0.0, 1e-3))
     flags, applied, _, scale = tick(memory)
-    assert scheduler.is_changed(make_image(memory))
+    assert scheduler.is_changed(image_of(memory))
     assert memory.ring.ticks["change"][250]
     np.testing.assert_allclose(memory.force[0], -make_spring_mass_model().discrete.d @ applied, rtol=1e-12)
     assert flags & Flags.SOFT_START
@@ -532,9 +548,9 @@ def test_another_model_is_faded_in_where_it_settles(
     settled = following.patch.body.state.copy()
     np.testing.assert_allclose(other.dense_a() @ settled + other.b @ np.array(position), settled, atol=1e-15)
 
-    image = make_image(memory)
+    image = image_of(memory)
     with_both = shared_memory.with_coupling(memory, fading)
-    scheduler.exchange(image, make_image(with_both))
+    scheduler.exchange(image, image_of(with_both))
     forces = [before]
     for i in range(300, 400):
         command(memory, i, position)
@@ -546,7 +562,7 @@ def test_another_model_is_faded_in_where_it_settles(
     np.testing.assert_allclose(forces, expected, rtol=0, atol=1e-6 * np.abs(final).max())
 
     done = shared_memory.with_coupling(memory, cross_fade.after(fading))
-    scheduler.exchange(image, make_image(done))
+    scheduler.exchange(image, image_of(done))
     command(memory, 400, position)
     repeat_tick(image, now_ns(memory))
     np.testing.assert_allclose(newest(memory)["force_n"][0], final, rtol=1e-9)
@@ -556,7 +572,7 @@ def arrive(memory: shared_memory.Memory, sequence: int, arrival_ns: int, depth_m
     """A command comes at this time; the ticks that ran, or minus the reason."""
     lease = memory.commands.lease[0]
     memory.commands.incoming[0] = (0, lease, sequence, 7, arrival_ns, -1, (0.0, 0.0, depth_m), STILL, 0)
-    return int(scheduler.arrive(make_image(memory), 1))
+    return int(scheduler.arrive(image_of(memory), 1))
 
 
 def test_an_early_command_waits_for_the_tick_and_a_second_one_replaces_it(
@@ -663,7 +679,7 @@ def test_the_deadline_loop_steps_once_each_period_of_wall_time(
 ) -> None:
     wake = os.eventfd(0)
     memory.shared[shared_memory.DEADLINE_NS] = start = time.monotonic_ns()
-    thread = threading.Thread(target=scheduler.run_at_deadlines, args=(make_image(memory), wake))
+    thread = threading.Thread(target=scheduler.run_at_deadlines, args=(image_of(memory), wake))
     stop_threads(memory, thread)
     thread.start()
     wait_for_ticks(memory, 400)
@@ -687,7 +703,7 @@ def test_the_deadline_loop_goes_on_while_python_is_busy(
     memory: shared_memory.Memory, stop_threads: Callable[[shared_memory.Memory, threading.Thread], None]
 ) -> None:
     wake = os.eventfd(0)
-    thread = threading.Thread(target=scheduler.run_at_deadlines, args=(make_image(memory), wake))
+    thread = threading.Thread(target=scheduler.run_at_deadlines, args=(image_of(memory), wake))
     stop_threads(memory, thread)
     memory.shared[shared_memory.DEADLINE_NS] = time.monotonic_ns()
     thread.start()
@@ -725,7 +741,7 @@ def test_no_tick_sees_half_a_message_of_several_tools(
 ) -> None:
     model = make_spring_mass_model(2)
     memory = shared_memory.make_memory(models.make_running(model), model.period_s, [FREE, FREE], 1 / 30)
-    image = make_image(memory)
+    image = image_of(memory)
     incoming = memory.commands.incoming
     _write_to_all(image, incoming, 0, 1)
     _run_ticks(image, 1)
@@ -766,7 +782,7 @@ def test_a_snapshot_belongs_to_one_tick(make_spring_mass_model: Callable[..., Re
     for i in range(50):
         command(memory, i, (1e-3 * i, 0.0, 0.0))
         tick(memory)
-        assert scheduler.read_snapshot(make_image(memory), state, applied) == i
+        assert scheduler.read_snapshot(image_of(memory), state, applied) == i
         np.testing.assert_allclose(state, expected, rtol=1e-12, atol=1e-18)
         expected = system.dense_a() @ expected + system.b @ applied.ravel()
 
@@ -775,7 +791,7 @@ def test_a_force_that_is_no_number_never_reaches_the_device_and_the_next_client_
     memory: shared_memory.Memory,
 ) -> None:
     """The last check before the wire, whatever the terms of a contact were: here a limit that is not a number."""
-    image = make_image(memory)
+    image = image_of(memory)
     broken = np.array(FREE._replace(max_damping_n_s_per_m=float("nan")))
     scheduler.set_limits(image, 0, broken)
     faults = memory.counters["faults"][0]
