@@ -70,6 +70,9 @@ class Connection:
         self._stopping = threading.Event()
         self._status_came = threading.Event()
         self.status: dict[str, Any] | None = None  # the newest
+        self.tool_in_use: str | None = (
+            None  # a release is of all tools of a client, so a connection has one at a time
+        )
         self._kept: list[object] = []  # references: Zenoh undeclares what is garbage-collected
         self._sequence = 0
         self._zenoh: zenoh.Session | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +22,7 @@ FIRST_FORCE_S = 3.0  # longest wait for the first force
 class Tool:
     """One tool of a connection; use it in a `with` statement, one at a time for each connection.
 
-    Entering acquires the tool, leaving releases all tools of the client.
+    Entering acquires the tool, leaving releases it.
 
     Parameters
     ----------
@@ -63,11 +64,15 @@ class Tool:
         self._forces: Subscription = None
 
     def __enter__(self) -> Tool:
-        """Raises Refused, ServerGone or Incompatible, and RuntimeError inside of the tool's own `with` statement."""
-        if self.contract.holding:
-            raise RuntimeError(f"the tool {self.name!r} is held already: use one `with` statement at a time")
+        """Raises Refused, ServerGone or Incompatible, and RuntimeError inside of another `with` statement of the connection's tools."""
+        if self._connection.tool_in_use is not None:
+            raise RuntimeError(
+                f"the connection uses the tool {self._connection.tool_in_use!r}: leave its `with` statement first, "
+                "or use a connection for each tool"
+            )
         self._acquire()
         self._forces = self._connection.on_tool_force(self.name, self._on_force)
+        self._connection.tool_in_use = self.name
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
@@ -75,6 +80,7 @@ class Tool:
             time.sleep(LAST_ANSWERS_S)
         lost = not self.contract.holding
         self.contract.released()
+        self._connection.tool_in_use = None
         try:
             self._forces.undeclare()
             self._connection.check()
@@ -88,7 +94,7 @@ class Tool:
         """Send the tip's position, m, and its velocity, m/s, in our frame: once each period.
 
         With a velocity, the server continues the motion for up to 5 ms when a command is late. Raises ServerGone or ToolLost: a device
-        renders zero from then on. Raises ValueError for what is not three numbers.
+        renders zero from then on. Raises ValueError for what is not three finite numbers: nothing is sent.
         """
         self._connection.check()
         if not self.contract.holding:
@@ -170,9 +176,11 @@ class Tool:
 def _vector(name: str, value: Sequence[float]) -> list[float]:
     try:
         x, y, z = map(float, value)  # numpy's numbers too
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} is {value!r}: expected three numbers") from None
-    return [x, y, z]
+        if math.isfinite(x) and math.isfinite(y) and math.isfinite(z):
+            return [x, y, z]
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise ValueError(f"{name} is {value!r}: expected three finite numbers")
 
 
 class OneSidedContact:

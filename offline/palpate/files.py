@@ -6,6 +6,7 @@ import os
 import stat
 import tempfile
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeGuard
 
@@ -79,6 +80,7 @@ def write_atomically(path: Path, data: bytes, inputs: Iterable[Path] = ()) -> No
     is left behind.
     """
     check_output(path, inputs)
+    missing = [folder for folder in path.parents if not folder.exists()]
     temporary: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -95,6 +97,9 @@ def write_atomically(path: Path, data: bytes, inputs: Iterable[Path] = ()) -> No
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # the first that is not empty: a file stands in it
+            for folder in missing:
+                folder.rmdir()
 
 
 def _kind(path: Path) -> str:

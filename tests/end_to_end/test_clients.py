@@ -97,9 +97,20 @@ def test_a_tool_is_held_from_entering_to_leaving_and_its_force_points_out_of_the
 
 def test_what_is_no_position_is_told_at_once(connection: Connection) -> None:
     with Tool(connection) as tool:
-        for wrong in ([0.0, 0.0], "abc", [0.0, 0.0, None], 5):
-            with pytest.raises(ValueError, match=r"position_m is .*: expected three numbers"):
+        for wrong in (
+            [0.0, 0.0],
+            "abc",
+            [0.0, 0.0, None],
+            5,
+            [0.0, 0.0, np.nan],
+            [np.inf, 0.0, 0.0],
+            [10**400, 0, 0],
+        ):
+            with pytest.raises(ValueError, match=r"position_m is .*: expected three finite numbers"):
                 tool.move(wrong)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="velocity_m_per_s is .*: expected three finite numbers"):
+            tool.move(tool.home_m, [0.0, np.nan, 0.0])
+        assert tool.contract.commands_sent == 0
         tool.move(np.zeros(3, np.float32))  # type: ignore[arg-type]
         assert any(press_until_a_force(tool))
 
@@ -112,7 +123,9 @@ def test_connection_and_tool_are_entered_once_at_a_time(connection: Connection) 
         tool.move(tool.home_m)
     for _ in range(2):
         with tool:
-            with pytest.raises(RuntimeError, match="'tip' is held already"), tool:
+            with pytest.raises(RuntimeError, match="the connection uses the tool 'tip'"), tool:
+                pass
+            with pytest.raises(RuntimeError, match="the connection uses the tool 'tip'"), Tool(connection):
                 pass
             assert any(press_until_a_force(tool))
     assert tool.contract.broken == []

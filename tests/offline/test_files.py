@@ -120,6 +120,18 @@ def test_a_full_disk_names_the_file_and_leaves_the_old_one(
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
+def test_a_full_disk_leaves_no_folder_that_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "there").mkdir()
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left on device"):
+        write_atomically(tmp_path / "there" / "new" / "newer" / "out", b"new")
+    assert list((tmp_path / "there").iterdir()) == []
+
+
 @pytest.mark.parametrize(
     "name", ["", ".", "..", "a/b", "a\0", "a\nb", "a\x1b[2J", "\u202egpm", "\ud800", "x" * 256, 3, None]
 )
