@@ -108,7 +108,7 @@ def test_what_is_no_position_is_told_at_once(connection: Connection) -> None:
         ):
             with pytest.raises(ValueError, match=r"position_m is .*: expected three finite numbers"):
                 tool.move(wrong)  # type: ignore[arg-type]
-        with pytest.raises(ValueError, match="velocity_m_per_s is .*: expected three finite numbers"):
+        with pytest.raises(ValueError, match=r"velocity_m_per_s is .*: expected three finite numbers"):
             tool.move(tool.home_m, [0.0, np.nan, 0.0])
         assert tool.contract.commands_sent == 0
         tool.move(np.zeros(3, np.float32))  # type: ignore[arg-type]
