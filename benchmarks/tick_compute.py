@@ -26,6 +26,7 @@ from numba import njit
 from numba.core.runtime import _nrt_python as _nrt
 from numba.core.runtime import rtsys
 
+from dense_form import dense_a
 from palpate_server import codec
 from palpate_server.bodies import state_space
 from palpate_server.coupling.models import make_running
@@ -118,7 +119,7 @@ def row(order: int, contacts: int, runs: int) -> None:
     system, channels = model.discrete, 3 * contacts
     inputs = np.random.default_rng(0).normal(size=(64, channels)) * 1e-3
     blocks = state_space.make_body(system)
-    dense = [state_space.aligned(matrix) for matrix in (system.dense_a(), system.b, system.c, system.d)]
+    dense = [state_space.aligned(matrix) for matrix in (dense_a(system), system.b, system.c, system.d)]
     dense_state, dense_force = state_space.aligned(np.zeros(order)), np.zeros(channels)
     scratch = (np.zeros(order), np.zeros(channels), np.zeros(order))
     dense_args = (*dense, dense_state, inputs, dense_force, *scratch)

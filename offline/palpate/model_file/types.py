@@ -80,13 +80,6 @@ class StateSpace:
         idle = (self.cross == 0) & np.all(self.b == 0, axis=1) & np.all(self.c == 0, axis=0)
         return int(np.any(idle[1::2]))
 
-    def dense_a(self) -> Array:
-        """(order, order), the state matrix A."""
-        a = np.diag(self.diagonal)
-        i = np.arange(self.order)
-        a[i, i ^ 1] = self.cross
-        return a
-
 
 @dataclass(frozen=True)
 class Surface:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from dense_form import dense_a
 from palpate.build import build_full_model
 from palpate.lti.block_form import to_block_form
 from palpate.lti.pole_residue import PoleResidueSystem
@@ -46,7 +47,7 @@ def test_the_sampled_model_has_scipys_response(rule: SamplingRule) -> None:
     system = relaxing_body() if rule == "bilinear" else stiff_contact()
     blocks = to_block_form(system)
     method = {"bilinear": "bilinear", "first-order-hold": "foh"}[rule]
-    matrices = (blocks.dense_a(), blocks.b, blocks.c, blocks.d)
+    matrices = (dense_a(blocks), blocks.b, blocks.c, blocks.d)
     a, b, c, d, _ = scipy.signal.cont2discrete(matrices, PERIOD_S, method=method)
     found = sample(system, PERIOD_S, rule)
     z = np.exp(1j * np.array([0.01, 0.3, 1.0, 3.0]))

@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
+from dense_form import dense_a
 from palpate.lti.block_form import to_block_form
 from palpate.lti.frequencies import maximum
 from palpate.lti.pole_residue import PoleResidueSystem
@@ -228,7 +229,7 @@ def test_surface_displacements_follow_the_full_model_between_the_fitted_frequenc
         h = LIVER_LIKE.transfer_factor(np.array([s]))[0]
         gain = -h / (s**2 + modes.squared_frequencies * h)
         exact = (modes.parameters * gain)[rows] @ modes.input_coupling + modes.patch_parameters[rows]
-        xi = np.linalg.solve(np.exp(s * PERIOD_S) * np.eye(running.order) - running.dense_a(), running.b)
+        xi = np.linalg.solve(np.exp(s * PERIOD_S) * np.eye(running.order) - dense_a(running), running.b)
         error = np.linalg.norm(surface.output @ xi + surface.feedthrough - exact, 2) / np.linalg.norm(
             exact, 2
         )

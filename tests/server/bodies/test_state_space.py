@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numba import njit
 
+from dense_form import dense_a
 from palpate.model_file import ReducedModel, StateSpace
 from palpate_server.bodies import state_space
 from palpate_server.coupling.models import make_running
@@ -23,7 +24,7 @@ def test_block_diagonal_steps_equal_dense_matrix_products(
     make_spring_mass_model: Callable[..., ReducedModel], n_contacts: int, n_modes: int
 ) -> None:
     system = make_spring_mass_model(n_contacts, n_modes).discrete
-    a, b, c, d = system.dense_a(), system.b, system.c, system.d
+    a, b, c, d = dense_a(system), system.b, system.c, system.d
     body = state_space.make_body(system)
     random = np.random.default_rng(0)
     expected_state = np.zeros(system.order)

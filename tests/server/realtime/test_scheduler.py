@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numba import njit
 
+from dense_form import dense_a
 from palpate.model_file import ReducedModel, StateSpace
 from palpate_client.wire import Flags
 from palpate_server.bodies import state_space
@@ -133,7 +134,7 @@ def test_forces_are_the_discrete_models_response_to_the_applied_displacements(
         command(memory, i, (1e-3 * np.sin(0.1 * i), 2e-3 * np.cos(0.03 * i), 1e-4 * i))
         _, applied, force, scale = tick(memory)
         expected = system.c @ state + system.d @ applied
-        state = system.dense_a() @ state + system.b @ applied
+        state = dense_a(system) @ state + system.b @ applied
         np.testing.assert_allclose(force, -scale * expected, rtol=0, atol=1e-12)  # on the tool
     assert scale == 1
 
@@ -270,7 +271,7 @@ def test_commands_and_forces_are_in_the_holders_frame(
         np.testing.assert_allclose(applied, position)
         displacement = scale * rotation @ (applied - origin)
         expected = scale * rotation.T @ (system.c @ state + system.d @ displacement)
-        state = system.dense_a() @ state + system.b @ displacement
+        state = dense_a(system) @ state + system.b @ displacement
         np.testing.assert_allclose(force, -fade * expected, rtol=0, atol=1e-11)
 
 
@@ -546,7 +547,7 @@ def test_another_model_is_faded_in_where_it_settles(
     following = patches_of(other, np.array([position]))
     fading = cross_fade.to_another(memory.coupling, following, 0.01)
     settled = following.patch.body.state.copy()
-    np.testing.assert_allclose(other.dense_a() @ settled + other.b @ np.array(position), settled, atol=1e-15)
+    np.testing.assert_allclose(dense_a(other) @ settled + other.b @ np.array(position), settled, atol=1e-15)
 
     image = image_of(memory)
     with_both = shared_memory.with_coupling(memory, fading)
@@ -784,7 +785,7 @@ def test_a_snapshot_belongs_to_one_tick(make_spring_mass_model: Callable[..., Re
         tick(memory)
         assert scheduler.read_snapshot(image_of(memory), state, applied) == i
         np.testing.assert_allclose(state, expected, rtol=1e-12, atol=1e-18)
-        expected = system.dense_a() @ expected + system.b @ applied.ravel()
+        expected = dense_a(system) @ expected + system.b @ applied.ravel()
 
 
 def test_a_force_that_is_no_number_never_reaches_the_device_and_the_next_client_starts_clean(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dense_form import dense_a
 from palpate.model_file import ReducedModel
 from palpate_server.realtime.safety import Limits
 from palpate_server.session.devices import PROFILES, Device, limits_for, stiffness_warnings, warnings_for
@@ -71,7 +72,7 @@ def test_the_sample_model_is_passive_at_every_frequency(
 ) -> None:
     """As its accuracy report says. By the dense response: no sinusoid gets energy out."""
     model = make_spring_mass_model(2, 20)
-    system, a = model.discrete, model.discrete.dense_a()
+    system, a = model.discrete, dense_a(model.discrete)
     for theta in np.linspace(0, np.pi, 300):
         g = system.c @ np.linalg.solve(np.exp(1j * theta) * np.eye(len(a)) - a, system.b) + system.d
         least = np.linalg.eigvalsh((g - g.conj().T) / 2j)[0]
