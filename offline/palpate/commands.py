@@ -49,8 +49,10 @@ def build() -> None:
         stages("libraries")
         with interrupts.ends_at_once():
             from palpate.build import build_model
+            from palpate.build_surface import build_surface_model
 
-        model = build_model(scene, options.scene.parent, stages)
+        build_kind = build_surface_model if scene.tool else build_model
+        model = build_kind(scene, options.scene.parent, stages)
         interrupts.check()
     save_model(model, path, inputs)
     print(accuracy_text(model, options.verbose))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.build import build_model
 from palpate.files import check_output, make_folder
-from palpate.model_file import ModelFileError, ReducedModel, load_model, save_model
+from palpate.model_file import ModelFileError, ReducedModel, load_patch_model, save_model
 from palpate.plots import Touch, draw_touch, require_matplotlib
 from palpate.progress import Progress
 from palpate.scene.schema import fingerprint, load_config
@@ -132,7 +132,7 @@ def _built(path: Path, config_path: Path, progress: Progress) -> ReducedModel:
     config = load_config(config_path)
     if path.exists():
         try:
-            model = load_model(path)
+            model = load_patch_model(path)
         except ModelFileError as error:
             progress("look at the model that is there")
             progress.note(f"{error}; building it again")

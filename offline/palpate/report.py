@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.model_file import Contact, ReducedModel
+from palpate.model_file import Contact, ReducedModel, SurfaceModel
 from palpate.model_file.advice import NOTABLE_ERROR, force_advice, percent
 
 GOOD_ERROR = 0.05  # below what a hand tells apart: from about 7 % of a force (Pang, Tan & Durlach 1991)
@@ -12,8 +12,10 @@ GOOD_ERROR = 0.05  # below what a hand tells apart: from about 7 % of a force (P
 Rows = list[tuple[str, str, str]]
 
 
-def accuracy_text(model: ReducedModel, verbose: bool = False) -> str:
+def accuracy_text(model: ReducedModel | SurfaceModel, verbose: bool = False) -> str:
     """The most important errors of a model, a verdict and advice; `verbose` adds every figure."""
+    if isinstance(model, SurfaceModel):
+        return _surface_text(model, verbose)
     lines = [f"\n{model.name}: {model.order} states instead of {model.n_states_full:,} ({model.method})"]
     lines += _columns(_first_screen(model))
     lines.append(f"  verdict: {_verdict(model)}")
@@ -112,6 +114,53 @@ def _figures(model: ReducedModel) -> Rows:
         ("energy given out", f"{accuracy.largest_energy_out_j:.2g} J", "at most, in one closed motion of 1 mm"),
         ("mesh resolves", f"{accuracy.resolved_frequency_hz:.3g} Hz", "shear waves with 6 nodes each"),
     ]  # fmt: skip
+
+
+def _surface_text(model: SurfaceModel, verbose: bool) -> str:
+    accuracy, (low, high) = model.accuracy, model.band_hz
+    n_free = int(np.count_nonzero(~model.held))
+    radius = min(tool.radius_m for tool in model.tools)
+    carried = accuracy.resolved_frequency_hz
+    rows = [
+        ("force while moving", f"wrong by at most {percent(accuracy.error_in_working_area)}", f"motions of {low:g} to {high:g} Hz, at the worst point of the working areas"),
+        ("", f"wrong by at most {percent(accuracy.error_in_band)}", f"at the worst of all {n_free:,} points; median {percent(accuracy.error_in_band_median)}"),
+        ("force at rest", f"wrong by {percent(accuracy.error_static)}", f"at the worst of a sample of the points; median {percent(accuracy.error_static_median)}"),
+        ("mesh", f"carries waves up to {carried:.3g} Hz", "where it is coarsest"),
+        ("energy", "never given out", f"passivity margin {accuracy.passivity_margin:.1g}, sampled {accuracy.passivity_margin_sampled:.1g}"),
+        ("largest stiffness", f"{accuracy.largest_stiffness_n_per_m:.3g} N/m", "in one tick, what a device can meet without a virtual coupling"),
+    ]  # fmt: skip
+    tools = ", ".join(f"{tool.name} ({1e3 * tool.radius_m:g} mm)" for tool in model.tools)
+    lines = [
+        f"\n{model.name}: {model.n_points:,} points to touch, {model.n_modes:,} modes, tools {tools}",
+        f"  errors are those of a tip of {1e3 * radius:g} mm radius, pressed in by half of it",
+        *_columns(rows),
+        f"  verdict: {_surface_verdict(model)}",
+    ]
+    if verbose:
+        figures = [
+            ("nodes", f"{model.n_nodes:,}", ""),
+            ("points", f"{model.n_points:,}", f"{model.n_points - n_free:,} of them held"),
+            ("triangles", f"{len(model.triangles):,}", ""),
+            ("highest mode", f"{np.sqrt(model.squared_frequencies[-1]) / (2 * np.pi):.3g} Hz", ""),
+            ("contact radius", f"{1e3 * accuracy.contact_radius_m:.3g} mm", "of the smallest tool, where errors are stated"),
+            ("shift of the residual", f"{accuracy.residual_shift_m_per_n:.2g} m/N", "makes it definite in spite of rounding"),
+        ]  # fmt: skip
+        lines += ["", "every figure (docs/model-file.md defines them):", *_columns(figures)]
+    else:
+        lines.append("  (--verbose shows every figure)")
+    return "\n".join(lines)
+
+
+def _surface_verdict(model: SurfaceModel) -> str:
+    accuracy = model.accuracy
+    worst = max(accuracy.error_in_working_area, accuracy.error_static)
+    if worst > NOTABLE_ERROR:
+        return f"poor: the force is wrong by up to {percent(worst)} of itself; lower surface.tolerance"
+    carried = accuracy.resolved_frequency_hz
+    mesh = "" if carried >= model.band_hz[1] else f"; the mesh limits it above {carried:.3g} Hz"
+    if worst > GOOD_ERROR:
+        return f"fair: a trained hand may feel the error{mesh}"
+    return f"good: the error is below what a hand tells apart{mesh}"
 
 
 def _columns(rows: Rows) -> list[str]:

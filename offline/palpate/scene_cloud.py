@@ -1,4 +1,4 @@
-"""The node cloud of a scene, its held nodes and contact patches, and the surface to show."""
+"""The node cloud of a scene, its held nodes, contact patches and tools, and the surface to show."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from palpate.geometry.cloud import NodeCloud, TriangleSurface
 from palpate.geometry.fill import fill_surface
 from palpate.geometry.refinement import refine_surface
-from palpate.geometry.regions import ContactPatch, contact_patch, nodes_in
+from palpate.geometry.regions import ContactPatch, contact_patch, distance_outside, nodes_in
+from palpate.geometry.sampling import depth_inside, sample_elements
 from palpate.geometry.shapes import ball, box_lattice
-from palpate.geometry.spacing import Refinement, SpacingField
+from palpate.geometry.spacing import RefinedArea, Refinement, SpacingField
 from palpate.geometry.surface import load_surface
+from palpate.model_file import ToolShape
 from palpate.progress import NO_PROGRESS, Progress
 from palpate.scene.schema import (
     BallGeometry,
@@ -31,6 +33,9 @@ _NEAR_SURFACE = 0.1
 
 _LEAST_PATCH = 0.25
 """Smallest area of a patch over that of a flat disc of its radius; a patch that wraps around the body has less."""
+
+_AREA_SAMPLES = 0.5
+"""Distance of a working area's samples over that of its nodes."""
 
 _SHOWN_EDGE = 1.5
 """Longest triangle edge of the surface that is shown near a refined contact, in node spacings."""
@@ -50,7 +55,8 @@ def build_cloud(config: Config, folder: Path, progress: Progress = NO_PROGRESS) 
             loaded = load_surface(folder / file, unit)
             for note in loaded.notes:
                 progress.warn(note)
-            return fill_surface(loaded.surface, spacing, _refinements(config))
+            areas = _working_areas(config, loaded.surface)
+            return fill_surface(loaded.surface, spacing, _refinements(config), areas)
 
 
 def fixed_nodes(config: Config, cloud: NodeCloud) -> Indices:
@@ -94,6 +100,63 @@ def shown_surface(config: Config, cloud: NodeCloud) -> TriangleSurface:
     return refine_surface(
         cloud.surface, lambda p: np.where(field(p) < spacing, _SHOWN_EDGE * field(p), longest)
     )
+
+
+def in_working_area(config: Config, points: Array) -> NDArray[np.bool_]:
+    """(n,): whether points (n, 3), m, of the surface lie in a working area; all do where the scene names none."""
+    regions = config.surface.working_area
+    if not regions:
+        return np.ones(len(points), dtype=bool)
+    return np.any([distance_outside(region, points) <= 0 for region in regions], axis=0)
+
+
+def tool_shapes(config: Config, cloud: NodeCloud) -> tuple[ToolShape, ...]:
+    """The scene's tools. One without a home starts two radii above a working area, away from the others.
+
+    Raises ValueError naming a tool whose home is not clear of the body.
+    """
+    on_surface = np.flatnonzero(cloud.boundary & in_working_area(config, cloud.points))
+    points, normals = cloud.points[on_surface], cloud.normals[on_surface]
+    away = np.linalg.norm(points - np.average(points, axis=0, weights=cloud.areas[on_surface]), axis=1)
+    shapes: list[ToolShape] = []
+    for tool in config.tool:
+        home = tool.home_m
+        if home is None:
+            start = np.argmin(away) if not shapes else np.argmax(away)
+            x, y, z = (points[start] + 3 * tool.radius_m * normals[start]).tolist()
+            home = (x, y, z)
+            from_start = np.linalg.norm(points - points[start], axis=1)
+            away = from_start if not shapes else np.minimum(away, from_start)
+        clear = -float(depth_inside(np.array([home]), cloud.surface)[0])
+        if clear <= tool.radius_m:
+            raise ValueError(
+                f"tool {tool.name!r}: home_m = {[round(v, 4) for v in home]} is {clear:.3g} m outside the body: expected more "
+                f"than radius_m = {tool.radius_m:g}"
+            )
+        shapes.append(ToolShape(tool.name, tool.radius_m, tool.friction, home))
+    return tuple(shapes)
+
+
+def _working_areas(config: Config, surface: TriangleSurface) -> tuple[RefinedArea, ...]:
+    """The part of the surface with finer nodes, none where the scene asks for none.
+
+    Raises ValueError naming a region that holds nothing of the surface.
+    """
+    spacing = config.surface.spacing_m
+    if not isinstance(config.geometry, SurfaceGeometry) or spacing is None or not config.tool:
+        return ()
+    samples, _ = sample_elements(
+        surface.vertices, surface.triangles, lambda p: np.full(len(p), spacing), _AREA_SAMPLES
+    )
+    for index, region in enumerate(config.surface.working_area):
+        if (nearest := float(distance_outside(region, samples.points).min())) > 0:
+            raise ValueError(
+                f"surface.working_area[{index}]: holds nothing of the surface, which is {nearest:.3g} m outside: expected a "
+                "region that holds a part of it, in m"
+            )
+    inside = in_working_area(config, samples.points)
+    area = float(samples.measures[inside].sum())
+    return (RefinedArea(samples.points[inside], area, spacing, config.geometry.growth),)
 
 
 def _refinements(config: Config) -> tuple[Refinement, ...]:

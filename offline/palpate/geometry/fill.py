@@ -21,7 +21,7 @@ from palpate.geometry.sampling import (
     sample_inside,
 )
 from palpate.geometry.sharp_edges import sharp_edges
-from palpate.geometry.spacing import Refinement, SpacingField
+from palpate.geometry.spacing import RefinedArea, Refinement, SpacingField
 from palpate.geometry.tributary import nearest_node, tributary_cells, tributary_measures
 from palpate.geometry.visibility import Gaps, find_gaps
 from palpate.scene.quantities import MAX_NODES
@@ -38,12 +38,17 @@ _RELAXATIONS = 12
 
 
 def fill_surface(
-    surface: TriangleSurface, spacing_m: float, refinements: Sequence[Refinement] = (), seed: int = 0
+    surface: TriangleSurface,
+    spacing_m: float,
+    refinements: Sequence[Refinement] = (),
+    refined_areas: Sequence[RefinedArea] = (),
+    seed: int = 0,
 ) -> NodeCloud:
     """Fill the inside of a surface that `check_surface` accepts; the boundary nodes lie on it and come first.
 
     spacing_m    distance between nodes away from the refinements, m
     refinements  round patches with nodes closer together
+    refined_areas  parts of the surface with nodes closer together
     seed         of the random order in which nodes are placed; the same seed gives the same cloud
 
     Nodes are placed on round patches, corners, sharp edges, faces and inside, in this order. Each time they are
@@ -57,9 +62,9 @@ def fill_surface(
     Raises ValueError when the spacing doesn't suit the body or a round patch finds no place on it.
     """
     refinements = tuple(_fitted(r, surface) for r in refinements)
-    _check_spacing(surface, spacing_m, refinements)
+    field = SpacingField(spacing_m, refinements, tuple(refined_areas))
+    _check_spacing(surface, field)
     rng = np.random.default_rng(seed)
-    field = SpacingField(spacing_m, refinements)
     gaps = find_gaps(surface, field)
     boundary = _boundary_nodes(surface, field, gaps, rng)
 
@@ -99,7 +104,8 @@ def _deeper_than(depth_m: Array, samples: InnerSamples, surface: TriangleSurface
     return deeper
 
 
-def _check_spacing(surface: TriangleSurface, spacing_m: float, refinements: tuple[Refinement, ...]) -> None:
+def _check_spacing(surface: TriangleSurface, field: SpacingField) -> None:
+    spacing_m = field.spacing_m
     extent = np.ptp(surface.vertices, axis=0)
     if spacing_m > extent.max() / 4:
         raise ValueError(
@@ -107,7 +113,8 @@ def _check_spacing(surface: TriangleSurface, spacing_m: float, refinements: tupl
             f"{' x '.join(f'{e:.3g}' for e in extent)} m"
         )
     volume = enclosed_volume(surface)
-    fine = sum(min(volume, 4 / 3 * np.pi * r.radius_m**3) / r.spacing_m**3 for r in refinements)
+    fine = sum(min(volume, 4 / 3 * np.pi * r.radius_m**3) / r.spacing_m**3 for r in field.refinements)
+    fine += sum(a.area_m2 / a.spacing_m**2 * (1 + 1 / a.growth) / 2 for a in field.areas)
     estimate = volume / spacing_m**3 + fine
     if estimate > MAX_NODES:
         raise ValueError(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.sampling import closest_point
-from palpate.scene.regions import BoxRegion, NearestRegion, PlaneRegion, Region, SphereRegion
+from palpate.scene.regions import AreaRegion, BoxRegion, NearestRegion, PlaneRegion, Region, SphereRegion
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -49,7 +49,7 @@ def nodes_in(region: Region, cloud: NodeCloud) -> Indices:
     if isinstance(region, NearestRegion):
         distance = np.linalg.norm(points - np.asarray(region.point_m), axis=1)
         return boundary[[np.argmin(distance)]]
-    outside = _distance_outside(region, points)
+    outside = distance_outside(region, points)
     chosen = boundary[outside <= _EDGE * cloud.spacing[boundary]]
     if len(chosen) == 0:
         where = points[np.argmin(outside)]
@@ -86,7 +86,7 @@ def contact_patch(point_m: Vector, radius_m: float, cloud: NodeCloud) -> Contact
     return ContactPatch(nodes, center, normal / np.linalg.norm(normal), radius_m)
 
 
-def _distance_outside(region: BoxRegion | PlaneRegion | SphereRegion, points: Array) -> Array:
+def distance_outside(region: AreaRegion, points: Array) -> Array:
     """How far points (n, 3) lie outside the region, m, (n,); 0 or less within it."""
     match region:
         case BoxRegion():
@@ -99,7 +99,7 @@ def _distance_outside(region: BoxRegion | PlaneRegion | SphereRegion, points: Ar
             return -(points - np.asarray(region.point_m)) @ normal
 
 
-def _describe(region: BoxRegion | PlaneRegion | SphereRegion) -> str:
+def _describe(region: AreaRegion) -> str:
     """The region in the keys and numbers of the scene."""
     match region:
         case BoxRegion():

@@ -1,11 +1,13 @@
-"""Distance between nodes as a function of place: coarse, and finer around round patches."""
+"""Distance between nodes as a function of place: coarse, finer around round patches and beneath parts of the surface."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 
@@ -32,11 +34,38 @@ class Refinement:
 
 
 @dataclass(frozen=True)
+class RefinedArea:
+    """A part of the surface with nodes closer together, and finer nodes beneath and around it.
+
+    points     (n, 3), m: samples of it, at most half a spacing apart
+    area_m2    its area
+    spacing_m  > 0, distance of the nodes on it, m
+    growth     as of a `Refinement`, for every meter away from it
+    """
+
+    points: Array
+    area_m2: float
+    spacing_m: float
+    growth: float = 0.3
+
+    def spacing(self, points: Array, most_m: float) -> Array:
+        """(n,), m: the spacing that it asks for at points (n, 3), m, at most `most_m`."""
+        reach = max(0.0, most_m - self.spacing_m) / self.growth
+        distance, _ = self._tree.query(points, distance_upper_bound=reach, workers=-1)
+        return self.spacing_m + self.growth * np.minimum(distance, reach)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points)
+
+
+@dataclass(frozen=True)
 class SpacingField:
-    """h(x) = min(spacing_m, refinement.spacing_m + growth * distance outside the refined ball)."""
+    """h(x) = min(spacing_m, part.spacing_m + growth * distance from the refined part), over all refined parts."""
 
     spacing_m: float
     refinements: tuple[Refinement, ...] = ()
+    areas: tuple[RefinedArea, ...] = ()
 
     def __call__(self, points: Array) -> Array:
         """Spacing in m at points (n, 3) in m, (n,)."""
@@ -44,4 +73,6 @@ class SpacingField:
         for r in self.refinements:
             outside = np.maximum(0.0, np.linalg.norm(points - np.asarray(r.center_m), axis=1) - r.radius_m)
             h = np.minimum(h, r.spacing_m + r.growth * outside)
+        for area in self.areas:
+            h = np.minimum(h, area.spacing(points, self.spacing_m))
         return h

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.files import printable
 from palpate.model_file.members import Header, arrays_of, check_shapes
+from palpate.model_file.surface_model import SurfaceAccuracy, SurfaceModel, ToolShape
 from palpate.model_file.types import (
     LONGEST_PERIOD_S,
     SHORTEST_PERIOD_S,
@@ -23,17 +26,23 @@ _LONGEST_NAME = 64
 _LONGEST_TEXT = 200
 
 
-def check_model(model: ReducedModel) -> None:
+def check_model(model: ReducedModel | SurfaceModel) -> None:
     """Check the values of a model; the reader checks what concerns the file.
 
     Raises ModelFileError, in one line that names the field and what was expected.
     """
     _text("name", model.name, _LONGEST_NAME)
-    _text("method", model.method, _LONGEST_TEXT)
     _text("built_with", model.built_with, _LONGEST_TEXT)
     _config(model)
     _number("period_s", model.period_s, SHORTEST_PERIOD_S, LONGEST_PERIOD_S)
     _whole("n_nodes", model.n_nodes)
+    if isinstance(model, SurfaceModel):
+        _tools(model.tools)
+        _band("band_hz", model.band_hz, model.period_s)
+        _accuracy_of_surface(model.accuracy)
+        _arrays_of_surface(model)
+        return
+    _text("method", model.method, _LONGEST_TEXT)
     _whole("n_states_full", model.n_states_full)
     _contacts(model.contacts)
     _accuracy(model)
@@ -51,7 +60,7 @@ def _text(field: str, value: object, longest: int) -> None:
         raise refuse(field, repr(value), f"text of 1 to {longest} printable characters")
 
 
-def _config(model: ReducedModel) -> None:
+def _config(model: ReducedModel | SurfaceModel) -> None:
     try:
         model.config.encode()
     except (AttributeError, UnicodeEncodeError):
@@ -99,27 +108,92 @@ def _accuracy(model: ReducedModel) -> None:
         value, name = getattr(accuracy, field.name), f"accuracy.{field.name}"
         if field.type == "float" or (field.type == "float | None" and value is not None):
             _number(name, value, 0.0 if field.name.startswith("error") else -math.inf)
-    band, highest = accuracy.band_hz, 0.5 / model.period_s
+    _band("accuracy.band_hz", accuracy.band_hz, model.period_s)
+
+
+def _band(field: str, band: tuple[float, float], period_s: float) -> None:
     if len(band) != 2:
-        raise refuse("accuracy.band_hz", band, "two numbers")
+        raise refuse(field, band, "two numbers")
     for value in band:
-        _number("accuracy.band_hz", value, 0.0, highest)
+        _number(field, value, 0.0, 0.5 / period_s)
     if not band[0] < band[1]:
-        raise refuse("accuracy.band_hz", band, "its lower end below its upper")
+        raise refuse(field, band, "its lower end below its upper")
 
 
 def _arrays(model: ReducedModel) -> None:
     arrays = arrays_of(model)
-    check_shapes({name: Header(array.dtype.str, array.shape) for name, array in arrays.items()})
+    check_shapes({name: Header(array.dtype.str, array.shape) for name, array in arrays.items()}, model.kind)
     channels = len(model.static_stiffness)
     if channels != model.n_inputs:
         raise refuse("static_stiffness", f"{channels} rows", f"{model.n_inputs}, three for each contact")
+    _finite(arrays)
+    _triangles("surface_triangles", model.surface.triangles, len(model.surface.vertices))
+
+
+def _finite(arrays: dict[str, NDArray[Any]]) -> None:
     for name, array in arrays.items():
         if not np.all(np.isfinite(array)):
             raise refuse(name, "not finite in some places", "finite numbers")
-    triangles, n_vertices = model.surface.triangles, len(model.surface.vertices)
+
+
+def _triangles(field: str, triangles: NDArray[np.int32], n_vertices: int) -> None:
     if triangles.size and not (triangles.min() >= 0 and triangles.max() < n_vertices):
-        raise refuse("surface_triangles", triangles.max(), f"indices of vertices, 0 to {n_vertices - 1}")
+        raise refuse(field, triangles.max(), f"indices of vertices, 0 to {n_vertices - 1}")
+
+
+def _tools(tools: tuple[ToolShape, ...]) -> None:
+    for index, tool in enumerate(tools):
+        where = f"tools[{index}]"
+        _text(f"{where}.name", tool.name, _LONGEST_NAME)
+        _number(f"{where}.radius_m", tool.radius_m, 1e-9, 1e3)
+        _number(f"{where}.friction", tool.friction, 0.0, 10.0)
+        if len(tool.home_m) != 3:
+            raise refuse(f"{where}.home_m", tool.home_m, "three numbers")
+        for value in tool.home_m:
+            _number(f"{where}.home_m", value, -1e5, 1e5)
+    names = [tool.name for tool in tools]
+    if not names or len(set(names)) < len(names):
+        raise refuse("tools", names, "at least one tool, and each name once")
+
+
+def _accuracy_of_surface(accuracy: SurfaceAccuracy) -> None:
+    for field in fields(SurfaceAccuracy):
+        if field.type == "float":
+            low = -math.inf if field.name.startswith("passivity") else 0.0
+            _number(f"accuracy.{field.name}", getattr(accuracy, field.name), low)
+
+
+def _arrays_of_surface(model: SurfaceModel) -> None:
+    """Whether the residual is semidefinite is not checked: the factorization that tells takes longer than reading."""
+    if model.residual.shape != (3 * model.n_points, 3 * model.n_points):
+        raise refuse("residual", model.residual.shape, f"{3 * model.n_points} rows and columns")
+    if not all(np.array_equal(a, b) for a, b in _mirrored(model.residual)):
+        raise refuse("residual", "not symmetric", "a symmetric matrix")
+    arrays = arrays_of(model)
+    check_shapes({name: Header(array.dtype.str, array.shape) for name, array in arrays.items()}, model.kind)
+    _finite(arrays)
+    _triangles("triangles", model.triangles, model.n_points)
+    lengths = np.linalg.norm(model.normals, axis=1)
+    if not np.all(np.abs(lengths - 1) < 1e-6):
+        raise refuse("normals", f"of lengths {lengths.min():.9g} to {lengths.max():.9g}", "unit vectors")
+    squared = model.squared_frequencies
+    if not (squared[0] > 0 and np.all(np.diff(squared) >= 0)):
+        raise refuse(
+            "squared_frequencies", "not positive and ascending", "positive numbers in ascending order"
+        )
+    for name in ("gamma", "tau_s"):
+        if not np.all(getattr(model, name) > 0):
+            raise refuse(name, getattr(model, name).min(), "numbers above 0")
+    if np.any(model.shapes[model.held]) or np.any(model.residual[np.repeat(model.held, 3)]):
+        raise refuse("held", "of points that move", "points whose shapes and residual are zero")
+    if not np.all(model.residual.diagonal() >= 0):
+        raise refuse("residual", "negative on its diagonal", "a positive semidefinite matrix")
+
+
+def _mirrored(matrix: NDArray[np.float32], rows: int = 256) -> Iterator[tuple[NDArray[np.float32], ...]]:
+    """Blocks of a matrix and of its transpose, some rows at a time."""
+    for start in range(0, len(matrix), rows):
+        yield matrix[start : start + rows], matrix[:, start : start + rows].T
 
 
 def _stable(model: ReducedModel) -> None:

@@ -6,8 +6,10 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
+from palpate.model_file.surface_model import SurfaceModel
 from palpate.model_file.types import ModelFileError, ReducedModel
 
 METADATA, CHECKSUM = "metadata", "sha256"  # the members beside the arrays, both uint8
@@ -15,7 +17,10 @@ METADATA, CHECKSUM = "metadata", "sha256"  # the members beside the arrays, both
 MAX_METADATA_BYTES = 2**20
 MAX_TOTAL_BYTES = 2**29
 """Bound on the unpacked size of a file, 512 MiB. The largest models expected, 1,200 states and a surface of 15,000
-vertices, unpack to 220 MiB."""
+vertices, unpack to 220 MiB; 4,000 points with 2,000 modes to 366 MiB."""
+
+Layout = dict[str, tuple[str, tuple[str, ...]]]
+"""dtype and shape of each array of a kind of model. A name in a shape stands for the same length wherever it occurs."""
 
 _STATE_SPACE: dict[str, tuple[str, ...]] = {
     "diagonal": ("order",),
@@ -25,7 +30,7 @@ _STATE_SPACE: dict[str, tuple[str, ...]] = {
     "d": ("channels", "channels"),
 }
 
-ARRAYS: dict[str, tuple[str, tuple[str, ...]]] = {
+_PATCH: Layout = {
     "static_stiffness": ("<f8", ("channels", "channels")),
     "hankel_singular_values": ("<f8", ("singular_values",)),
     **{f"continuous_{name}": ("<f8", shape) for name, shape in _STATE_SPACE.items()},
@@ -39,11 +44,32 @@ ARRAYS: dict[str, tuple[str, tuple[str, ...]]] = {
     "surface_output": ("<f4", ("3*vertices", "order")),
     "surface_feedthrough": ("<f4", ("3*vertices", "channels")),
 }
-"""dtype and shape of each array of a model. A name in a shape stands for the same length wherever it occurs."""
+
+_SURFACE: Layout = {
+    "points": ("<f8", ("points", "3")),
+    "normals": ("<f8", ("points", "3")),
+    "triangles": ("<i4", ("triangles", "3")),
+    "held": ("|u1", ("points",)),
+    "squared_frequencies": ("<f8", ("modes",)),
+    "shapes": ("<f4", ("points", "3", "modes")),
+    "residual": ("<f4", ("packed",)),
+    "gamma": ("<f8", ("terms",)),
+    "tau_s": ("<f8", ("terms",)),
+    "error_map": ("<f4", ("points",)),
+}
+
+LAYOUTS: dict[str, Layout] = {ReducedModel.kind: _PATCH, SurfaceModel.kind: _SURFACE}
 
 
-def arrays_of(model: ReducedModel) -> dict[str, NDArray[Any]]:
-    """The arrays of a model under the names of their members."""
+def arrays_of(model: ReducedModel | SurfaceModel) -> dict[str, NDArray[Any]]:
+    """The arrays of a model under the names of their members, as the file holds them."""
+    if isinstance(model, SurfaceModel):
+        named = {name: getattr(model, name) for name in _SURFACE if name != "error_map"}
+        return named | {
+            "held": model.held.astype(np.uint8),
+            "residual": packed(model.residual),
+            "error_map": model.accuracy.error_map,
+        }
     arrays: dict[str, NDArray[Any]] = {
         "static_stiffness": model.static_stiffness,
         "hankel_singular_values": model.accuracy.hankel_singular_values,
@@ -70,10 +96,34 @@ class Header:
         return f"{self.dtype} {self.shape}"
 
 
-def check_shapes(headers: dict[str, Header]) -> None:
+def packed(residual: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(n (n + 1) / 2,): the lower triangle of a symmetric matrix (n, n), row by row."""
+    return np.concatenate([row[: i + 1] for i, row in enumerate(residual)])
+
+
+def unpacked(triangle: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(n, n): the symmetric matrix of a lower triangle that `packed` made."""
+    n = triangular_root(len(triangle))
+    matrix = np.zeros((n, n), dtype=np.float32)
+    start = 0
+    for i in range(n):
+        matrix[i, : i + 1] = triangle[start : start + i + 1]
+        start += i + 1
+    diagonal = matrix.diagonal().copy()
+    matrix += matrix.T
+    np.fill_diagonal(matrix, diagonal)
+    return matrix
+
+
+def triangular_root(count: int) -> int:
+    """The rows of a triangle with at most `count` entries."""
+    return (math.isqrt(8 * count + 1) - 1) // 2
+
+
+def check_shapes(headers: dict[str, Header], kind: str) -> None:
     """Check that the arrays of one model fit each other. Raises ModelFileError that names the first that does not."""
     lengths: dict[str, int] = {"3": 3}
-    for name, (dtype, dimensions) in ARRAYS.items():
+    for name, (dtype, dimensions) in LAYOUTS[kind].items():
         header = headers[name]
         expected = []
         for axis, dimension in enumerate(dimensions):
@@ -86,6 +136,13 @@ def check_shapes(headers: dict[str, Header]) -> None:
                 f"field '{name}' is {header}: expected {dtype} ({', '.join(dimensions)}), "
                 f"here {tuple(expected)}"
             )
+    if kind == SurfaceModel.kind:
+        _check_lengths_of_surface(lengths)
+    else:
+        _check_lengths_of_patch(lengths)
+
+
+def _check_lengths_of_patch(lengths: dict[str, int]) -> None:
     if not lengths["channels"] or lengths["channels"] % 3:
         raise ModelFileError(
             f"field 'static_stiffness' has {lengths['channels']} rows: expected three for each contact"
@@ -93,4 +150,17 @@ def check_shapes(headers: dict[str, Header]) -> None:
     if not lengths["order"] or lengths["order"] % 2:
         raise ModelFileError(
             f"field 'discrete_diagonal' has length {lengths['order']}: expected an even one (2x2 blocks), at least 2"
+        )
+
+
+def _check_lengths_of_surface(lengths: dict[str, int]) -> None:
+    n = 3 * lengths["points"]
+    if not lengths["points"] or not lengths["modes"]:
+        raise ModelFileError(
+            f"field 'shapes' is of {lengths['points']} points and {lengths['modes']} modes: expected one or more of each"
+        )
+    if lengths["packed"] != n * (n + 1) // 2:
+        raise ModelFileError(
+            f"field 'residual' has {lengths['packed']} entries: expected {n * (n + 1) // 2}, the lower triangle of a matrix "
+            f"with {n} rows"
         )

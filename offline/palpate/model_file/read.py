@@ -18,14 +18,16 @@ from palpate.files import printable
 from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.model_file.check import check_model, refuse
 from palpate.model_file.members import (
-    ARRAYS,
     CHECKSUM,
+    LAYOUTS,
     MAX_METADATA_BYTES,
     MAX_TOTAL_BYTES,
     METADATA,
     Header,
     check_shapes,
+    unpacked,
 )
+from palpate.model_file.surface_model import SURFACE_SCALARS, SurfaceAccuracy, SurfaceModel, ToolShape
 from palpate.model_file.types import (
     FORMAT,
     SCALARS,
@@ -53,7 +55,7 @@ _NPY_HEADER = re.compile(
 Part = TypeVar("Part")
 
 
-def load_model(path: Path) -> ReducedModel:
+def load_model(path: Path) -> ReducedModel | SurfaceModel:
     """Read and check a model file. Memory stays within twice `MAX_TOTAL_BYTES`, whatever the file holds.
 
     Raises FileNotFoundError if there is none, OSError if it can't be opened, and ModelFileError, in one line that names
@@ -76,19 +78,30 @@ def load_model(path: Path) -> ReducedModel:
     return model
 
 
-def _read(file: IO[bytes]) -> ReducedModel:
+def load_patch_model(path: Path) -> ReducedModel:
+    """Read a model whose tools are bound to patches. Raises as `load_model`, and ModelFileError for another kind."""
+    model = load_model(path)
+    if isinstance(model, SurfaceModel):
+        raise ModelFileError(
+            f"{printable(path)}: field 'kind' is {model.kind!r}: expected {ReducedModel.kind!r}, which this command can use"
+        )
+    return model
+
+
+def _read(file: IO[bytes]) -> ReducedModel | SurfaceModel:
     _check_directory(file)
     with zipfile.ZipFile(file) as archive:
         _check_sizes(archive)
         metadata = _metadata(archive)
-        known = {f"{name}.npy" for name in (METADATA, CHECKSUM, *ARRAYS)}
+        kind = metadata["kind"]
+        known = {f"{name}.npy" for name in (METADATA, CHECKSUM, *LAYOUTS[kind])}
         for member in archive.namelist():
             if member not in known:
                 shown = printable(member.removesuffix(".npy"), 80)
                 raise ModelFileError(f"field '{shown}' is unknown: expected none beside a model's")
-        check_shapes({name: _open(archive, name)[1] for name in ARRAYS})
-        arrays = _arrays(archive)
-    return _assemble(metadata, arrays)
+        check_shapes({name: _open(archive, name)[1] for name in LAYOUTS[kind]}, kind)
+        arrays = _arrays(archive, list(LAYOUTS[kind]))
+    return _surface_model(metadata, arrays) if kind == SurfaceModel.kind else _patch_model(metadata, arrays)
 
 
 def _check_directory(file: IO[bytes]) -> None:
@@ -165,10 +178,10 @@ def _bytes(archive: zipfile.ZipFile, name: str) -> bytes:
     return _take(archive, name, hashlib.sha256()).tobytes()
 
 
-def _arrays(archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
+def _arrays(archive: zipfile.ZipFile, names: list[str]) -> dict[str, NDArray[Any]]:
     """The arrays. Raises ModelFileError where the checksum of all members is wrong."""
     digest = hashlib.sha256()
-    arrays = {name: _take(archive, name, digest) for name in sorted([*ARRAYS, METADATA])}
+    arrays = {name: _take(archive, name, digest) for name in sorted([*names, METADATA])}
     if _bytes(archive, CHECKSUM) != digest.digest():
         raise ModelFileError(
             "field 'sha256' is not the checksum of the content: the file is damaged, build it again"
@@ -196,20 +209,52 @@ def _metadata(archive: zipfile.ZipFile) -> dict[str, Any]:
             else "it was written by an older palpate, build it again with `palpate build`"
         )
         raise refuse("schema_version", repr(version), f"{SCHEMA_VERSION}; {hint}")
-    if scalars.get("kind") != ReducedModel.kind:
-        raise refuse(
-            "kind", repr(scalars.get("kind")), f"{ReducedModel.kind!r}, the kind that this version can run"
-        )
+    if not (isinstance(scalars.get("kind"), str) and scalars["kind"] in LAYOUTS):
+        raise refuse("kind", repr(scalars.get("kind")), " or ".join(map(repr, LAYOUTS)))
     return scalars
 
 
-def _assemble(scalars: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> ReducedModel:
-    """The model, of parts whose values have not been checked yet."""
-    _exactly(scalars, "", ["format", "schema_version", "kind", "units", *SCALARS, "contacts", "accuracy"])
+def _units(scalars: dict[str, Any]) -> None:
     _exactly(scalars["units"], "units.", list(UNITS))
     for quantity, unit in UNITS.items():
         if scalars["units"][quantity] != unit:
             raise refuse(f"units.{quantity}", repr(scalars["units"][quantity]), repr(unit))
+
+
+def _surface_model(scalars: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> SurfaceModel:
+    """A surface model, of parts whose values have not been checked yet."""
+    stated = ["format", "schema_version", "kind", "units", *SURFACE_SCALARS, "band_hz", "tools", "accuracy"]
+    _exactly(scalars, "", stated)
+    _units(scalars)
+    if not isinstance(scalars["tools"], list):
+        raise refuse("tools", repr(scalars["tools"]), "a list")
+    _exactly(
+        scalars["accuracy"], "accuracy.", [f.name for f in fields(SurfaceAccuracy) if f.name != "error_map"]
+    )
+    if not np.all(arrays["held"] <= 1):
+        raise refuse("held", int(arrays["held"].max()), "0 or 1 for each point")
+    plain = ("points", "normals", "triangles", "squared_frequencies", "shapes", "gamma", "tau_s")
+    stored: dict[str, Any] = {name: arrays[name] for name in plain}
+    return SurfaceModel(
+        **{name: scalars[name] for name in SURFACE_SCALARS},
+        band_hz=_numbers(scalars["band_hz"], "band_hz"),
+        tools=tuple(_tool(table, f"tools[{i}].") for i, table in enumerate(scalars["tools"])),
+        held=arrays["held"].astype(bool),
+        residual=unpacked(arrays["residual"]),
+        accuracy=SurfaceAccuracy(**scalars["accuracy"], error_map=arrays["error_map"]),
+        **stored,
+    )
+
+
+def _tool(table: Any, where: str) -> ToolShape:
+    _exactly(table, where, [field.name for field in fields(ToolShape)])
+    return ToolShape(**table | {"home_m": _numbers(table["home_m"], where + "home_m")})
+
+
+def _patch_model(scalars: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> ReducedModel:
+    """A patch model, of parts whose values have not been checked yet."""
+    _exactly(scalars, "", ["format", "schema_version", "kind", "units", *SCALARS, "contacts", "accuracy"])
+    _units(scalars)
     if not isinstance(scalars["contacts"], list):
         raise refuse("contacts", repr(scalars["contacts"]), "a list")
     of_file = [field.name for field in fields(AccuracyReport) if field.name != "hankel_singular_values"]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from palpate.model_file.types import FORMAT, SCHEMA_VERSION, UNITS
 
 Array = NDArray[np.float64]
 
@@ -23,6 +25,46 @@ class ToolShape:
     radius_m: float
     friction: float
     home_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class SurfaceAccuracy:
+    """How good a surface model is, for the smallest tool pressed in by half its radius; against the assembled body.
+
+    The tool displaces the points in contact alike; C is the compliance of this footprint, (3, 3). An error is the largest,
+    over the directions, of |force error| / |force|. Relative errors are fractions.
+
+    contact_radius_m          radius of the contact, sqrt(radius * depth) (Hertz 1882)
+    error_static              largest at 0 Hz over a sample of the points, against static solutions of their own
+    error_static_median       the median over the sample
+    error_in_band             largest in the band over all points that are not held: a bound, before sampling
+    error_in_band_median      the median over the points
+    error_in_working_area     the largest over the points of the working areas, where tools are meant to touch
+    error_map                 (n_points,) float32: the bound at each point, 0 at held ones
+    passivity_margin          smallest eigenvalue, over the points and up to half the sampling rate, of the part of w C(jw) that
+                              dissipates, over |w C(0)|; 0 or above to round-off, else no model is made
+    passivity_margin_sampled  the same for the displacement in a tick under a force held over it, sampled for period_s
+    largest_stiffness_n_per_m  that a device meets in one tick along the normal, over the points that are not held
+    residual_shift_m_per_n    what was added to the diagonal of the residual, so that it is definite in spite of rounding
+    resolved_frequency_hz     up to where the cloud carries shear waves with 6 nodes a wavelength, where it is coarsest
+    """
+
+    contact_radius_m: float
+    error_static: float
+    error_static_median: float
+    error_in_band: float
+    error_in_band_median: float
+    error_in_working_area: float
+    passivity_margin: float
+    passivity_margin_sampled: float
+    largest_stiffness_n_per_m: float
+    residual_shift_m_per_n: float
+    resolved_frequency_hz: float
+    error_map: NDArray[np.float32]
+
+
+SURFACE_SCALARS = ("name", "period_s", "n_nodes", "config", "config_sha256", "built_with")
+"""The fields of `SurfaceModel` that the metadata of a file states unchanged."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +103,12 @@ class SurfaceModel:
     config: str
     config_sha256: str
     built_with: str
+    accuracy: SurfaceAccuracy
+
+    @property
+    def order(self) -> int:
+        """Number of modes."""
+        return self.n_modes
 
     @property
     def n_points(self) -> int:
@@ -69,3 +117,30 @@ class SurfaceModel:
     @property
     def n_modes(self) -> int:
         return len(self.squared_frequencies)
+
+    def metadata(self) -> dict[str, Any]:
+        """All but the arrays, as a file stores it: plain numbers, lists and strings."""
+        accuracy = asdict(self.accuracy)
+        del accuracy["error_map"]
+        return {
+            "format": FORMAT,
+            "schema_version": SCHEMA_VERSION,
+            "kind": self.kind,
+            "units": UNITS,
+            **{name: getattr(self, name) for name in SURFACE_SCALARS},
+            "band_hz": list(self.band_hz),
+            "tools": [asdict(tool) for tool in self.tools],
+            "accuracy": accuracy,
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """What `palpate inspect --json` prints: the metadata without the scene, and the sizes."""
+        metadata = self.metadata()
+        del metadata["config"]
+        return metadata | {
+            "order": self.order,
+            "highest_mode_hz": float(np.sqrt(self.squared_frequencies[-1]) / (2 * np.pi)),
+            "n_points": self.n_points,
+            "n_held_points": int(np.count_nonzero(self.held)),
+            "n_triangles": len(self.triangles),
+        }

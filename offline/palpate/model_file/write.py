@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from palpate.files import write_atomically
 from palpate.model_file.check import check_model
-from palpate.model_file.members import ARRAYS, CHECKSUM, METADATA, arrays_of
+from palpate.model_file.members import CHECKSUM, LAYOUTS, METADATA, arrays_of
+from palpate.model_file.surface_model import SurfaceModel
 from palpate.model_file.types import ReducedModel
 
 
-def save_model(model: ReducedModel, path: Path, inputs: Iterable[Path] = ()) -> None:
+def save_model(model: ReducedModel | SurfaceModel, path: Path, inputs: Iterable[Path] = ()) -> None:
     """Write a model file; readers see the old file or the complete new one.
 
     inputs  files that may not be overwritten: what the model was built from
@@ -27,7 +28,8 @@ def save_model(model: ReducedModel, path: Path, inputs: Iterable[Path] = ()) -> 
     Raises ModelFileError for a model that `load_model` would refuse, OSError where nothing can be written.
     """
     check_model(model)
-    members = {name: _npy(array, ARRAYS[name][0]) for name, array in arrays_of(model).items()}
+    layout = LAYOUTS[model.kind]
+    members = {name: _npy(array, layout[name][0]) for name, array in arrays_of(model).items()}
     metadata = json.dumps(model.metadata(), allow_nan=False).encode()
     members[METADATA] = _npy(np.frombuffer(metadata, np.uint8), "|u1")
 

@@ -94,8 +94,8 @@ class HeldBody:
         return static + self.shift * self.body.inertia(parameters) if self.shift else static
 
 
-def hold(body: AssembledBody, nodes: Indices, shift: float = 0.0) -> HeldBody:
-    """Factorize K + shift M with the nodes held; the shift, (rad/s)², is not negative.
+def hold(body: AssembledBody, nodes: Indices, shift: float = 0.0, n_solves: int = 0) -> HeldBody:
+    """Factorize K + shift M with the nodes held; the shift, (rad/s)², is not negative. About n_solves loads will come.
 
     Raises ValueError for a body that is not symmetric; LinAlgError where the nodes do not hold the body or the shape
     functions of two held nodes are the same; MemoryError where the factor does not fit.
@@ -108,7 +108,7 @@ def hold(body: AssembledBody, nodes: Indices, shift: float = 0.0) -> HeldBody:
         nodes=nodes,
         shift=shift,
         constraints=csr_array(kron(rows, eye_array(body.n_components), format="csr")),
-        factor=factorize(penalized(body, nodes, shift)),
+        factor=factorize(penalized(body, nodes, shift), n_solves=n_solves),
         gram=factorize(csr_array(rows @ rows.T)),
     )
 

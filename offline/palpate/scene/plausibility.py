@@ -74,8 +74,10 @@ def _numbers(config: Config) -> Iterator[str]:
     tables: dict[str, Table] = {
         "material": config.material,
         "geometry": config.geometry,
-        "reduction": config.reduction,
+        **({"surface": config.surface} if config.tool else {"reduction": config.reduction}),
     }
+    tables |= {f"tool '{tool.name}'": tool for tool in config.tool}
+    tables |= {f"surface.working_area[{i}]": region for i, region in enumerate(config.surface.working_area)}
     tables |= {f"contact '{contact.name}'": contact for contact in config.contact}
     tables |= {f"fixed[{index}]": region for index, region in enumerate(config.fixed)}
     for where, table in tables.items():

@@ -1,4 +1,4 @@
-"""Regions of the surface where a scene fixes the nodes. The only definition: `palpate.geometry.regions` finds their nodes."""
+"""Regions of the surface, where a scene fixes the nodes or lets tools work. The only definition: `palpate.geometry.regions` finds their nodes."""
 
 from __future__ import annotations
 
@@ -59,3 +59,6 @@ class NearestRegion(Table):
 
 
 Region = BoxRegion | PlaneRegion | SphereRegion | NearestRegion
+
+AreaRegion = BoxRegion | PlaneRegion | SphereRegion
+"""A region that holds a part of the surface with an area."""

@@ -24,7 +24,7 @@ from palpate.scene.quantities import (
     ReductionMethod,
     Table,
 )
-from palpate.scene.regions import Region
+from palpate.scene.regions import AreaRegion, Region
 
 _SHORTEST_TAU_IN_PERIODS = 0.01
 """A faster branch acts as a damper, and its terms are lost in round-off."""
@@ -83,7 +83,10 @@ class SurfaceGeometry(Table):
     file_unit: LengthUnit = Field(default="m", description="unit of the file's coordinates")
     spacing_m: Length
     growth: Number = Field(
-        default=0.3, gt=0, le=0.5, description="growth of the spacing per meter away from a refined contact"
+        default=0.3,
+        gt=0,
+        le=0.5,
+        description="growth of the spacing per meter away from a refined contact or working area",
     )
 
 
@@ -94,6 +97,44 @@ class ContactTable(Table):
     point_m: Point = Field(description="the patch is centered at the surface point nearest to this")
     radius_m: Length
     spacing_m: Length | None = Field(default=None, description="node spacing on the patch; unset: unrefined")
+
+
+class ToolTable(Table):
+    """A rigid sphere that touches the body anywhere on its surface."""
+
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,31}$")
+    radius_m: Length
+    friction: Number = Field(ge=0, le=2, description="Coulomb's coefficient against the tissue")
+    home_m: Point | None = Field(
+        default=None, description="where its center starts, clear of the surface; unset: above a working area"
+    )
+
+
+class SurfaceTable(Table):
+    """Where tools touch, and what the model of the surface must reach."""
+
+    spacing_m: Length | None = Field(
+        default=None, description="of the points that are touched in the working areas; unset: the cloud's"
+    )
+    working_area: tuple[Annotated[AreaRegion, Field(discriminator="region")], ...] = Field(
+        default=(), description="parts of the surface with this spacing; unset: all of it"
+    )
+    tolerance: Number = Field(
+        default=0.05,
+        ge=1e-4,
+        le=1,
+        description="largest relative force error of the smallest tool in the band: it decides how many modes are kept",
+    )
+    modes: Count | None = Field(default=None, ge=1, description="number of modes; displaces tolerance")
+    band_hz: tuple[Number, Number] = (0.0, 30.0)
+    period_s: Number = Field(default=1e-3, ge=SHORTEST_PERIOD_S, le=LONGEST_PERIOD_S)
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> SurfaceTable:
+        if self.working_area and self.spacing_m is None:
+            raise ValueError("spacing_m = None: expected the spacing of the points in working_area")
+        _check_band(self.band_hz, self.period_s)
+        return self
 
 
 class MaterialTable(Table):
@@ -177,53 +218,88 @@ class ReductionTable(Table):
             raise ValueError(
                 f"order = {self.order} and tolerance = {self.tolerance}: expected exactly one of them"
             )
-        low, high = self.band_hz
-        if not 0 <= low < high < 0.5 / self.period_s:
-            raise ValueError(
-                f"band_hz = {list(self.band_hz)}: expected 0 <= low < high < {0.5 / self.period_s:g} Hz, "
-                "half the sampling rate"
-            )
+        _check_band(self.band_hz, self.period_s)
         return self
 
 
+def _check_band(band_hz: tuple[float, float], period_s: float) -> None:
+    low, high = band_hz
+    if not 0 <= low < high < 0.5 / period_s:
+        raise ValueError(
+            f"band_hz = {list(band_hz)}: expected 0 <= low < high < {0.5 / period_s:g} Hz, half the sampling rate"
+        )
+
+
 class Config(Table):
-    """A whole scene."""
+    """A whole scene: with contacts for a patch model, or with tools for a surface model."""
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")
     geometry: Annotated[BoxGeometry | BallGeometry | SurfaceGeometry, Field(discriminator="shape")]
     material: MaterialTable
     fixed: tuple[Annotated[Region, Field(discriminator="region")], ...] = Field(min_length=1)
-    contact: tuple[ContactTable, ...] = Field(min_length=1)
+    contact: tuple[ContactTable, ...] = ()
+    tool: tuple[ToolTable, ...] = ()
+    surface: SurfaceTable = SurfaceTable()
     discretization: DiscretizationTable = DiscretizationTable()
     reduction: ReductionTable = ReductionTable(tolerance=0.01)
 
     @model_validator(mode="after")
-    def _contacts_can_be_told_apart(self) -> Config:
-        names = [c.name for c in self.contact]
+    def _is_of_one_kind(self) -> Config:
+        if bool(self.contact) == bool(self.tool):
+            given = "both" if self.tool else "neither"
+            raise ValueError(
+                f"{given} of [[contact]] and [[tool]]: expected one kind, contacts for tips bound to patches, tools for "
+                "touching anywhere"
+            )
+        kind, tables = ("contact", self.contact) if self.contact else ("tool", self.tool)
+        names = [table.name for table in tables]
         if len(set(names)) < len(names):
-            raise ValueError(f"contact names {names}: expected each name once")
-        if not isinstance(self.geometry, SurfaceGeometry):
-            for contact in self.contact:
-                if contact.spacing_m is not None:
-                    raise ValueError(
-                        f"contact {contact.name!r} has spacing_m, but a {self.geometry.shape} is a uniform cloud: "
-                        "only a surface can be refined around a contact"
-                    )
-        if self.reduction.method == "passive":
+            raise ValueError(f"{kind} names {names}: expected each name once")
+        other = "surface" if self.contact else "reduction"
+        if other in self.model_fields_set:
+            raise ValueError(f"{other}: unknown in a scene with [[{kind}]] tables; remove it")
+        return self
+
+    @model_validator(mode="after")
+    def _cloud_can_be_refined(self) -> Config:
+        if isinstance(self.geometry, SurfaceGeometry):
+            if self.surface.spacing_m is not None and self.surface.spacing_m > self.geometry.spacing_m:
+                raise ValueError(
+                    f"surface.spacing_m = {self.surface.spacing_m:g}: expected at most geometry.spacing_m, "
+                    f"{self.geometry.spacing_m:g}"
+                )
+            return self
+        refined = [f"contact {c.name!r}" for c in self.contact if c.spacing_m is not None]
+        refined += ["surface"] if self.surface.spacing_m is not None else []
+        if refined:
+            raise ValueError(
+                f"{refined[0]} has spacing_m, but a {self.geometry.shape} is a uniform cloud: only a cloud inside a "
+                "surface can be refined"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _method_suits(self) -> Config:
+        needs = "[[tool]] needs" if self.tool else "reduction.method 'passive' needs"
+        if self.tool or self.reduction.method == "passive":
             for key, value, needed in (
                 ("discretization.method", self.discretization.method, "conservative"),
                 ("reduction.sampling", self.reduction.sampling, "bilinear"),
             ):
                 if value != needed:
-                    raise ValueError(
-                        f"{key} = {value!r}: reduction.method 'passive' needs {needed!r}; or choose another, such as 'tbr-band'"
-                    )
-        shortest = _SHORTEST_TAU_IN_PERIODS * self.reduction.period_s
+                    other = "" if self.tool else "; or choose another, such as 'tbr-band'"
+                    raise ValueError(f"{key} = {value!r}: {needs} {needed!r}{other}")
+        return self
+
+    @model_validator(mode="after")
+    def _can_be_sampled(self) -> Config:
+        table = "surface" if self.tool else "reduction"
+        shortest = _SHORTEST_TAU_IN_PERIODS * getattr(self, table).period_s
         too_short = [tau for tau in self.material.material().prony.tau_s if tau < shortest]
         if too_short:
             raise ValueError(
                 f"material.tau_s holds {too_short[0]:g}: expected at least {shortest:g} s, "
-                f"{_SHORTEST_TAU_IN_PERIODS:g} of reduction.period_s"
+                f"{_SHORTEST_TAU_IN_PERIODS:g} of {table}.period_s"
             )
         return self
 
@@ -261,7 +337,14 @@ def override_reduction(
 
     Raises ConfigError.
     """
-    tables = config.model_dump(mode="json", exclude_none=True)
+    if method is None and order is None and tolerance is None:
+        return config
+    if config.tool:
+        raise ConfigError(
+            "command line: method, order and tolerance are of the reduction, and a scene with [[tool]] tables has none: "
+            "expected surface.tolerance or surface.modes in the scene"
+        )
+    tables = config.model_dump(mode="json", exclude_none=True, exclude=_of_the_other_kind(config))
     reduction = tables["reduction"]
     if method is not None:
         reduction["method"] = method
@@ -274,7 +357,12 @@ def override_reduction(
 
 def canonical_text(config: Config) -> str:
     """The configuration as JSON with all defaults filled in: what a model file records."""
-    return config.model_dump_json(exclude_none=True)
+    return config.model_dump_json(exclude_none=True, exclude=_of_the_other_kind(config))
+
+
+def _of_the_other_kind(config: Config) -> set[str]:
+    """The tables that have no meaning in a scene of this kind."""
+    return {"contact", "reduction"} if config.tool else {"tool", "surface"}
 
 
 def fingerprint(config: Config, folder: Path) -> str:
@@ -310,7 +398,7 @@ def _line(error: Any) -> str:
     key, last = key or "scene", str(parts[-1]) if parts else ""
     value, message = error["input"], error["msg"].removeprefix("Value error, ")
     match error["type"]:
-        case "tuple_type" if parts in (["fixed"], ["contact"]):
+        case "tuple_type" if parts in (["fixed"], ["contact"], ["tool"], ["surface", "working_area"]):
             return f"{key}: expected a list of tables, [[{key}]]"
         case "missing":
             return f"{key}: missing, it is required"

@@ -1,0 +1,38 @@
+"""Cholesky's factorization of the dense matrix by LAPACK: for some thousands of right-hand sides faster than SuperLU."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky
+from scipy.linalg.lapack import dpotrs
+from scipy.sparse import csr_array
+
+Array = NDArray[np.float64]
+
+
+class DenseCholesky:
+    """The factor of a positive definite matrix given by its upper triangle. Raises LinAlgError where it is not definite.
+
+    nnz         entries of the factor
+    n_negative  negative eigenvalues of the matrix: none
+    """
+
+    n_negative = 0
+
+    def __init__(self, upper: csr_array) -> None:
+        n = upper.shape[0]
+        self.nnz = n * (n + 1) // 2
+        self._factor = cholesky(upper.toarray(order="F"), overwrite_a=True, check_finite=False)
+
+    def solve(self, right: Array) -> Array:
+        """(n, k) for right-hand sides (n, k)."""
+        solution, info = dpotrs(self._factor, right)
+        if info != 0:
+            raise np.linalg.LinAlgError(f"LAPACK's dpotrs refuses its argument {-info}")
+        return solution
+
+
+def dense_memory(n_rows: int) -> float:
+    """Bytes of the factor."""
+    return 8.0 * n_rows**2
