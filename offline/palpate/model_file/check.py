@@ -167,7 +167,7 @@ def _arrays_of_surface(model: SurfaceModel) -> None:
     """Whether the residual is semidefinite is not checked: the factorization that tells takes longer than reading."""
     if model.residual.shape != (3 * model.n_points, 3 * model.n_points):
         raise refuse("residual", model.residual.shape, f"{3 * model.n_points} rows and columns")
-    if not all(np.array_equal(a, b) for a, b in _mirrored(model.residual)):
+    if not all(np.array_equal(a, b, equal_nan=True) for a, b in _mirrored(model.residual)):
         raise refuse("residual", "not symmetric", "a symmetric matrix")
     arrays = arrays_of(model)
     check_shapes({name: Header(array.dtype.str, array.shape) for name, array in arrays.items()}, model.kind)

@@ -273,8 +273,7 @@ class Config(Table):
         refined += ["surface"] if self.surface.spacing_m is not None else []
         if refined:
             raise ValueError(
-                f"{refined[0]} has spacing_m, but a {self.geometry.shape} is a uniform cloud: only a cloud inside a "
-                "surface can be refined"
+                f"{refined[0]} has spacing_m, but a {self.geometry.shape} is a uniform cloud: only a surface's cloud can be refined"
             )
         return self
 
@@ -391,7 +390,8 @@ _UNIT_HINTS = {"period_s": " (in s: 1 ms is 0.001)", "tolerance": " (a fraction:
 
 def _line(error: Any) -> str:
     """One of pydantic's errors as a line: the key, the value and what was expected."""
-    parts = [part for part in error["loc"] if part not in (*_TAGS["shape"], *_TAGS["region"])]
+    tags = (*_TAGS["shape"], *_TAGS["region"])
+    parts = [part for i, part in enumerate(error["loc"]) if i == 0 or part not in tags]
     key = ""
     for part in parts:
         key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
@@ -407,7 +407,7 @@ def _line(error: Any) -> str:
         case "union_tag_invalid" | "union_tag_not_found":
             tag = error["ctx"]["discriminator"].strip("'")
             got = f" = {error['ctx']['tag']!r}:" if "tag" in error["ctx"] else ": missing,"
-            return f"{key}.{tag}{got} expected one of {', '.join(map(repr, _TAGS[tag]))}"
+            return f"{key}.{tag}{got} expected one of {error['ctx'].get('expected_tags', ', '.join(map(repr, _TAGS[tag])))}"
         case "value_error":
             if last and message.startswith(f"{last} = "):  # a field's own words
                 return key.removesuffix(last) + message

@@ -139,7 +139,7 @@ def without_states(metadata: dict[str, Any], arrays: dict[str, Any]) -> None:
         (meta("schema_version", 4), "'schema_version' is 4: .*newer palpate"),
         (meta("schema_version", True), "'schema_version' is True"),
         (meta("format", "other"), "'format' is 'other'"),
-        (meta("kind", "surface"), "'kind' is 'surface': expected 'patch'"),
+        (meta("kind", "voxels"), "'kind' is 'voxels': expected 'patch' or 'surface'"),
         (meta("units", {"length": "mm"}), "'units.displacement' is missing"),
         (lambda m, a: m["units"].update(length="mm"), "'units.length' is 'mm': expected 'm'"),
         (meta("contacts", []), r"'static_stiffness' is 3 rows|'contacts' is \[\]"),

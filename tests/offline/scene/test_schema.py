@@ -123,7 +123,7 @@ def test_every_shipped_scene_is_valid(scene: Path) -> None:
         ("material.tau_s", None, ["material", "gamma and tau_s"]),
         ("fixed", [], ["fixed", "at least 1"]),
         ("fixed.0.region", "line", ["fixed[0].region", "'line'", "'plane'"]),
-        ("contact", None, ["contact", "missing"]),
+        ("contact", None, ["neither of [[contact]] and [[tool]]"]),
         ("contact.0.radius_m", 0.0, ["contact[0].radius_m = 0.0", "at least 1e-06", "5 mm is 0.005"]),
         ("contact.0.spacing_m", 0.01, ["'tip'", "spacing_m", "only a surface"]),
         ("contact.0.name", "a b", ["contact[0].name", "'a b'"]),
