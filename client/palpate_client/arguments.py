@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
 
 from palpate_client import wire
 from palpate_client.connection import Connection
@@ -57,3 +58,15 @@ def positive(text: str) -> float:
     if not SMALLEST <= value <= LARGEST:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number from {SMALLEST:g} to {LARGEST:g}")
     return value
+
+
+def positive_up_to(largest: float) -> Callable[[str], float]:
+    """The type of an option whose value is positive and at most `largest`."""
+
+    def number(text: str) -> float:
+        value = positive(text)
+        if value > largest:
+            raise argparse.ArgumentTypeError(f"{text!r} is above {largest:g}")
+        return value
+
+    return number

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import time
 from importlib.resources import files
@@ -98,33 +99,13 @@ def surface() -> None:
     options = parser.parse_args()
     if not 100 <= options.triangles <= 1_000_000:
         parser.error(f"--triangles {options.triangles}: expected 100 to 1000000")
-    with stage_reporter() as stages:
-        stages("libraries")
-        with interrupts.ends_at_once():
-            from palpate.files import check_output, write_atomically
-            from palpate.geometry.label_image import read_label_image
-            from palpate.geometry.label_surface import label_surface
-            from palpate.geometry.measures import enclosed_volume
-            from palpate.geometry.ply import ply_bytes
-
-        require_ply(options.output)
-        check_output(options.output, [options.image])
-        stages("image")
-        image = read_label_image(options.image)
-        stages.note(f"{' x '.join(map(str, image.labels.shape))} voxels")
-        stages("surface")
-        found = label_surface(image, options.label, options.triangles)
-    body = found.surface
-    write_atomically(options.output, ply_bytes(body.vertices, body.triangles), [options.image])
-    median, most, largest = found.distance_m * 1e3
-    if found.n_islands:
-        print(f"left out {found.n_islands:,} pieces of the label apart from the largest")
-    if found.cavities_m3:
-        print(f"filled cavities of {found.cavities_m3 * 1e6:.4g} cm³")
-    print(
-        f"label    {found.label_m3 * 1e6:.5g} cm³\nsurface  {enclosed_volume(body) * 1e6:.5g} cm³, "
-        f"{len(body.triangles):,} triangles\noutermost voxels are {median:.2g} mm from it (median), {most:.2g} mm (95 %), "
-        f"{largest:.2g} mm (largest)\nwrote {options.output}, in m"
+    _make_ply(
+        "palpate.geometry.label_surface",
+        "surface_file",
+        options.image,
+        options.output,
+        options.label,
+        options.triangles,
     )
 
 
@@ -135,24 +116,24 @@ def repair() -> None:
     parser.add_argument("surface", type=Path, metavar="IN", help="STL, OBJ, PLY, OFF, VTK or VTP")
     parser.add_argument("--output", "-o", type=Path, metavar="OUT.ply", required=True)
     options = parser.parse_args()
+    _make_ply("palpate.geometry.repair", "repair_surface", options.surface, options.output)
+
+
+def _make_ply(module: str, function: str, source: Path, output: Path, *arguments: object) -> None:
+    """Write the PLY file that module.function(source, *arguments) makes, and print the lines that it returns with it."""
     with stage_reporter() as stages:
         stages("libraries")
         with interrupts.ends_at_once():
             from palpate.files import check_output, write_atomically
-            from palpate.geometry.repair import repair_surface
 
-        require_ply(options.output)
-        check_output(options.output, [options.surface])
-        stages("repair")
-        data, changes = repair_surface(options.surface)
-    write_atomically(options.output, data, [options.surface])
-    print(*changes, f"wrote {options.output}", sep="\n")
-
-
-def require_ply(path: Path) -> None:
-    """Raises ValueError unless the name is that of a PLY file."""
-    if path.suffix.lower() != ".ply":
-        raise ValueError(f"{path}: expected a name that ends in .ply")
+            make = getattr(importlib.import_module(module), function)
+        if output.suffix.lower() != ".ply":
+            raise ValueError(f"{output}: expected a name that ends in .ply")
+        check_output(output, [source])
+        stages("surface")
+        data, lines = make(source, *arguments)
+    write_atomically(output, data, [source])
+    print(*lines, f"wrote {output}", sep="\n")
 
 
 def demo() -> None:

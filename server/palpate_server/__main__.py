@@ -18,7 +18,7 @@ import zenoh
 
 from palpate.files import make_folder, printable
 from palpate.model_file import ModelFileError, load_patch_model
-from palpate_client.arguments import positive
+from palpate_client.arguments import positive, positive_up_to
 from palpate_client.wire import DEFAULT_ENDPOINT, DEFAULT_SESSION, Keys
 from palpate_server.arguments import index, need
 from palpate_server.coupling import models
@@ -144,7 +144,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_folders(parser)
     parser.add_argument(
         "--surface-hz",
-        type=_surface_rate,
+        type=positive_up_to(MAX_SURFACE_HZ),
         default=DEFAULT_SURFACE_HZ,
         metavar="HZ",
         help=f"surfaces a second while somebody subscribes, up to {MAX_SURFACE_HZ:g} (default: %(default)s)",
@@ -191,13 +191,6 @@ def _add_limits(group: argparse._ArgumentGroup) -> None:
         group.add_argument(
             name, type=positive, default=default, metavar=metavar, help=f"{text}(default: %(default)s)"
         )
-
-
-def _surface_rate(text: str) -> float:
-    value = positive(text)
-    if value > MAX_SURFACE_HZ:
-        raise argparse.ArgumentTypeError(f"{text} is above {MAX_SURFACE_HZ:g}")
-    return value
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ def test_a_processor_is_an_integer(value: str, capsys: pytest.CaptureFixture[str
 
 
 def test_a_check_of_the_host_takes_an_hour_at_most(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "'1e6' is more than 3600" in refusal(check_host.main, "--seconds=1e6", capsys=capsys)
+    assert "'1e6' is above 3600" in refusal(check_host.main, "--seconds=1e6", capsys=capsys)
 
 
 def test_a_folder_that_cannot_be_used_is_found_at_the_start(

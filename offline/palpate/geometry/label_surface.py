@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import fast_simplification
 import numpy as np
@@ -11,8 +12,9 @@ from scipy import ndimage, optimize
 from skimage.measure import marching_cubes
 
 from palpate.geometry.cloud import TriangleSurface
-from palpate.geometry.label_image import LabelImage
+from palpate.geometry.label_image import LabelImage, read_label_image
 from palpate.geometry.measures import enclosed_volume
+from palpate.geometry.ply import ply_bytes
 from palpate.geometry.repair import Repair, mend
 from palpate.geometry.sampling import depth_inside
 
@@ -42,6 +44,24 @@ class LabelSurface:
     n_islands: int
     cavities_m3: float
     distance_m: Array
+
+
+def surface_file(path: Path, label: int, n_triangles: int) -> tuple[bytes, list[str]]:
+    """A PLY file, in m, with the surface of a label of an image file; and lines about it. Raises as `label_surface`."""
+    image = read_label_image(path)
+    found = label_surface(image, label, n_triangles)
+    body, (median, most, largest) = found.surface, found.distance_m * 1e3
+    lines = [f"image    {' x '.join(map(str, image.labels.shape))} voxels"]
+    if found.n_islands:
+        lines.append(f"left out {found.n_islands:,} pieces of the label apart from the largest")
+    if found.cavities_m3:
+        lines.append(f"filled cavities of {found.cavities_m3 * 1e6:.4g} cm³")
+    lines += [
+        f"label    {found.label_m3 * 1e6:.5g} cm³",
+        f"surface  {enclosed_volume(body) * 1e6:.5g} cm³, {len(body.triangles):,} triangles, in m",
+        f"outermost voxels are {median:.2g} mm from it (median), {most:.2g} mm (95 %), {largest:.2g} mm (largest)",
+    ]
+    return ply_bytes(body.vertices, body.triangles), lines
 
 
 def label_surface(image: LabelImage, label: int, n_triangles: int) -> LabelSurface:

@@ -26,7 +26,7 @@ import zenoh
 
 import palpate_server.session.server  # noqa: F401, it runs in a child process; a missing package is found here, at the start
 from palpate.model_file import save_model
-from palpate_client.arguments import positive
+from palpate_client.arguments import positive_up_to
 from palpate_client.connection import open_session
 from palpate_client.errors import ClientError
 from palpate_client.local_server import free_endpoint, running
@@ -237,7 +237,10 @@ def _share(name: str, share: float, bounds: Bounds, advice: str) -> Finding:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="palpate check-host", description=(__doc__ or "").splitlines()[0])
     parser.add_argument(
-        "--seconds", type=_seconds, default=10.0, help="length of the tick run, up to an hour (%(default)s s)"
+        "--seconds",
+        type=positive_up_to(_LONGEST_S),
+        default=10.0,
+        help="length of the tick run, up to an hour (%(default)s s)",
     )
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     options = parser.parse_args(arguments)
@@ -261,13 +264,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if finding.verdict != GOOD:
                 print(f"  {finding.name}: {finding.advice}")
     return 1 if verdict == NOT_SUFFICIENT else 0
-
-
-def _seconds(text: str) -> float:
-    value = positive(text)
-    if value > _LONGEST_S:
-        raise argparse.ArgumentTypeError(f"{text!r} is more than {_LONGEST_S:.0f}")
-    return value
 
 
 if __name__ == "__main__":

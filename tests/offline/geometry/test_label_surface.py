@@ -193,7 +193,7 @@ def test_the_command_writes_a_surface_that_a_scene_takes_in_m(tmp_path: Path) ->
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr
     assert "left out 1 pieces of the label" in done.stdout
-    assert "wrote half.ply, in m" in done.stdout
+    assert "triangles, in m\n" in done.stdout
     surface = load_surface(tmp_path / "half.ply").surface
     assert enclosed_volume(surface) == pytest.approx(2 / 3 * np.pi * 0.02**3, rel=0.05)
     center = IMAGE.origin_m + IMAGE.axes_m @ CENTER
