@@ -27,7 +27,7 @@ import zenoh
 
 from palpate.model_file import ReducedModel, save_model
 from palpate_client.local_server import free_endpoint
-from palpate_client.wire import FORCE_FIELDS, KEEP_ALIVES, LEASE_MS
+from palpate_client.wire import FORCE_FIELDS, KEEP_ALIVES, LEASE_MS, PER_TICK
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.recording.replay import read_recording
 
@@ -425,7 +425,7 @@ def forces_in() -> Callable[[Path], list[dict[str, Any]]]:
         recorded = read_recording(path)
         return [
             {"tick": int(tick["tick"]), "server_time_ns": int(tick["start_ns"])}
-            | {name: ports[name].tolist() for name in list(FORCE_FIELDS)[2:]}
+            | {name: ports[name].tolist() for name, (count, _) in FORCE_FIELDS.items() if count != PER_TICK}
             for tick, ports in zip(recorded.ticks, recorded.ports, strict=True)
         ]
 
