@@ -287,9 +287,10 @@ def test_nobody_hears_an_observer(connect_as: Callable[..., Any]) -> None:
         changes.undeclare()
 
 
+@pytest.mark.parametrize("number", [500, pytest.param(2000, marks=pytest.mark.slow)])
 @pytest.mark.usefixtures("server")
 def test_an_observer_that_declares_thousands_of_keys_costs_an_operator_nothing(
-    connect_as: Callable[..., Any], assert_ticks_went_on: Callable[..., None]
+    connect_as: Callable[..., Any], assert_ticks_went_on: Callable[..., None], number: int
 ) -> None:
     with connect_as("operator") as operator, connect_as("observer") as observer:
         assert operator.acquire("tip")[0]
@@ -298,14 +299,15 @@ def test_an_observer_that_declares_thousands_of_keys_costs_an_operator_nothing(
             before = operator.next_status()
             declared = [
                 observer.session.declare_subscriber(f"palpate/x{i}/force", lambda sample: None)
-                for i in range(2000)
+                for i in range(number)
             ]
             tokens = [
-                observer.session.liveliness().declare_token(f"palpate/main/client/x{i}") for i in range(2000)
+                observer.session.liveliness().declare_token(f"palpate/main/client/x{i}")
+                for i in range(number)
             ]
             assert observer.query("describe")[0]  # behind the declarations, on the same link
             after = operator.next_status()
-        assert len(declared) == len(tokens) == 2000
+        assert len(declared) == len(tokens) == number
         assert after["tools"]["tip"]["holder"] == "operator"
         assert_ticks_went_on(before, after)
 

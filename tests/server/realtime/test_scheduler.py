@@ -730,11 +730,9 @@ def _write_to_all(image: Image, incoming: np.ndarray, first: int, stop: int) -> 
         scheduler.hand_over(image, incoming.shape[0])
 
 
-@njit(nogil=True)
 def _run_ticks(image: Image, n: int) -> None:
     for _ in range(n):
-        now = monotonic_ns()
-        scheduler.repeat_tick(image, now, now, False)
+        repeat_tick(image, monotonic_ns())
 
 
 def test_no_tick_sees_half_a_message_of_several_tools(
