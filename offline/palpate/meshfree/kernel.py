@@ -62,6 +62,7 @@ def evaluate(
 
     pivot is the smallest Cholesky pivot over its diagonal entry: 0 where A is singular (the row is then left unset).
     """
+    # One function, long as it is: its steps share a dozen work arrays of a few kilobytes, which stay in the cache.
     indptr, indices, reach = pairs.indptr, pairs.indices, pairs.reach
     value, first, second, pivot = out.value, out.first, out.second, out.pivot
     n_points, dim = points.shape
