@@ -14,9 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
+from palpate_client import Connection, ServerGone, Tool, steps
 from palpate_client.local_server import free_endpoint
-from palpate_client.wire import Flags, pack
+from palpate_client.wire import LEASE_MS, MAX_MESSAGE_BYTES, Flags, pack, unpack_map
+
+SESSION = "test"
 
 # Of the server below. A press of DEPTH_M (50 N/m when it has settled, more before) goes beyond the largest force, and
 # one tick may change it by a fiftieth of that: the lowest rate that is accepted, so a step beyond it has room to show.
@@ -188,3 +192,48 @@ def test_a_router_that_is_restarted_fades_the_force_and_lets_the_client_come_bac
             client.force_when(lambda force: force["force_scale"][0] > 0, "the force")
         check(client.forces)
     assert served.process.poll() is None
+
+
+STOPS, STOPPED_S = 5, 1.3e-3 * LEASE_MS
+
+
+@pytest.mark.slow
+def test_clients_come_back_to_a_server_that_was_stopped_past_the_lease_and_ignore_messages_on_a_wrong_key(
+    serve: Callable[..., Any], wait_for: Callable[..., Any]
+) -> None:
+    """Zenoh may put messages on a wrong key then (docs/server.md): each has to be one that the library has ignored."""
+    served = serve()
+    wrong: list[object] = []
+
+    def look(kind: str, sample: zenoh.Sample) -> None:
+        if (found := unpack_map(sample.payload.to_bytes(), MAX_MESSAGE_BYTES).get("kind")) != kind:
+            wrong.append(found)
+
+    def is_gone(connection: Connection) -> bool:
+        try:
+            connection.check()
+        except ServerGone:
+            return True
+        return False
+
+    with Connection(served.endpoint, SESSION) as connection:
+        forces: list[int] = []
+        connection.on_force(lambda message, at_ns: forces.append(message["tick"]))
+        subscribers = [
+            connection.zenoh.declare_subscriber(key, partial(look, kind))
+            for key, kind in ((connection.keys.force, "force"), (connection.keys.status, "status"))
+        ]
+        for _ in range(STOPS):
+            served.process.send_signal(signal.SIGSTOP)
+            time.sleep(STOPPED_S)
+            served.process.send_signal(signal.SIGCONT)
+            wait_for(partial(is_gone, connection), "the end of the link")
+            connection.reconnect(60.0)
+            seen = len(forces)
+            with Tool(connection, silence_s=30.0) as tool:
+                for _ in steps(0.3, 0.001):
+                    tool.move(tool.at_depth(0.002))
+            wait_for(lambda seen=seen: len(forces) - seen, "forces after the stop", lambda more: more > 100)
+            assert tool.contract.broken == []
+        assert connection.ignored == len(wrong)
+        assert len(subscribers) == 2
