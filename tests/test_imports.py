@@ -62,6 +62,7 @@ ROOMS = (
     "build_surface",
     "report",
     "plots",
+    "fitting",
     "stages",
     "demo",
     "commands",

@@ -26,6 +26,7 @@ _BUILD, _SERVE, _TOUCH, _WATCH = "Build a model", "Run it", "Touch it", "Look at
 COMMANDS = {
     "demo": Command(_BUILD, "build the liver, serve it, poke it, and draw what was felt", "all", "palpate.commands", "demo"),
     "build": Command(_BUILD, "build a scene into a model file, and say how accurate it is", "build", "palpate.commands", "build"),
+    "fit": Command(_BUILD, "fit the material of a scene to measured records of a tissue", "build", "palpate.commands", "fit"),
     "inspect": Command(_BUILD, "say what a model file holds and how accurate it is", "server", "palpate.commands", "inspect"),
     "surface": Command(_BUILD, "take the surface of a label of an image, smooth and closed, in m", "images", "palpate.commands", "surface"),
     "repair": Command(_BUILD, "mend a surface file until it bounds one body, and say what was changed", "build", "palpate.commands", "repair"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import math
 import time
 from importlib.resources import files
 from pathlib import Path
@@ -134,6 +135,65 @@ def _make_ply(module: str, function: str, source: Path, output: Path, *arguments
         data, lines = make(source, *arguments)
     write_atomically(output, data, [source])
     print(*lines, f"wrote {output}", sep="\n")
+
+
+def fit() -> None:
+    """Fit the material of a scene to measured records of a tissue, and say what they don't tell."""
+    parser = argparse.ArgumentParser(
+        description=fit.__doc__,
+        epilog="Columns: time_s, strain, stress_pa; or time_s, displacement_m, force_n; or frequency_hz, storage_pa, loss_pa.",
+    )
+    parser.add_argument("records", type=Path, nargs="+", metavar="RECORD.csv", help="records of one tissue")
+    parser.add_argument(
+        "--length-m", type=positive, metavar="L", help="of a specimen pulled or pressed along it"
+    )
+    parser.add_argument("--area-m2", type=positive, metavar="A", help="of its cross section")
+    parser.add_argument(
+        "--tip-radius-m", type=positive, metavar="R", help="of a sphere pressed into a thick body"
+    )
+    parser.add_argument(
+        "--partial",
+        action="store_true",
+        help="give what can be told also where a part of the material can't be",
+    )
+    parser.add_argument(
+        "--picture", type=Path, metavar="OUT.png", help="draw records, fit, residuals, loss tangent"
+    )
+    parser.add_argument("--json", action="store_true", help="all figures, machine-readable")
+    options = parser.parse_args()
+    with interrupts.ends_at_once():
+        from palpate.files import check_output
+        from palpate.fitting.picture import draw_tissue
+        from palpate.fitting.records import Specimen, read_record
+        from palpate.fitting.summary import material_toml, tissue_json, tissue_text
+        from palpate.fitting.tissue import NotIdentifiable, fit_tissue
+        from palpate.plots import require_matplotlib
+
+    if options.picture:
+        require_matplotlib()
+        check_output(options.picture, options.records)
+    specimen = Specimen(options.length_m, options.area_m2, options.tip_radius_m)
+    try:
+        tissue = fit_tissue([read_record(path, specimen) for path in options.records], options.partial)
+    except NotIdentifiable as error:
+        raise NotIdentifiable(f"{error}\n--partial gives what can be told all the same") from error
+    if options.picture:
+        draw_tissue(tissue, options.picture)
+    if options.json:
+        print(json.dumps(tissue_json(tissue), indent=2))
+    else:
+        print(tissue_text(tissue), "", material_toml(tissue), sep="\n")
+
+
+def positive(text: str) -> float:
+    """A finite number above zero. Raises argparse.ArgumentTypeError."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a number above zero")
+    return value
 
 
 def demo() -> None:

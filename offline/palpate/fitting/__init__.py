@@ -1,0 +1,1 @@
+"""From a measured record of a tissue to its stiffness at rest and its Prony series."""
