@@ -65,6 +65,19 @@ def correlation_time_of(residuals: Array) -> float:
     return (1 + r) / (1 - min(r, 0.999))
 
 
+def further_branch(fit: Fit, column: Array, correlation_time: float = 1.0) -> float:
+    """By how many of its standard deviations the amplitude of one more branch would be positive (a score test).
+
+    column  (n_rows,), what the branch adds to the rows
+    """
+    new = column - fit.jacobian @ np.linalg.lstsq(fit.jacobian, column, rcond=None)[0]
+    size = float(np.linalg.norm(new))
+    if size < 1e-6 * float(np.linalg.norm(column)):
+        return 0.0  # the fitted branches can do the same
+    error = max(fit.rms, SMALLEST_ERROR) * correlation_time**0.5
+    return float(-fit.residuals @ new) / (size * error)
+
+
 def intervals(quantities: Callable[[Array], Array], estimate: Estimate) -> tuple[Interval, ...]:
     """An interval for each quantity, such that all hold together with a probability of at least CONFIDENCE.
 

@@ -3,35 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from palpate.fitting.branches import Branches
-
-Array = NDArray[np.float64]
 
 
 def relaxation_of(creep: Branches) -> Branches:
     """The modulus E + sum_j E_j s tau_j / (1 + s tau_j) = 1 / J(s), with J(s) = J_0 + sum_k J_k / (1 + s lambda_k).
 
-    All E_j are positive, and each tau_j lies below its lambda_k and above the next shorter one: poles and zeros of a
-    passive compliance alternate (N. W. Tschoegl, The Phenomenological Theory of Linear Viscoelastic Behavior, 1989).
+    J is the transfer function of x' = -diag(rates) x + v stress, strain = J_0 stress + v' x, with rates 1 / lambda_k and
+    v_k² = J_k / lambda_k. Solved for the stress it has the symmetric matrix diag(rates) + v v' / J_0, whose eigenvalues are
+    the rates 1 / tau_j. So all E_j are positive, and the tau_j and lambda_k alternate
+    (N. W. Tschoegl, The Phenomenological Theory of Linear Viscoelastic Behavior, 1989).
     """
-    instant, parts, times = creep.amplitudes[0], creep.amplitudes[1:], creep.times
-    rates = 1 / times  # falling
-
-    # With s = -r, each zero of J lies between a rate and the next faster one; the fastest has a bound of its own.
-    def compliance(r: float) -> float:
-        return float(instant + np.sum(parts * rates / (rates - r)))
-
-    fastest = rates[:1] * (1 + 2 * np.sum(parts) / instant)
-    zeros = []
-    for slow, fast in zip(rates, [*fastest, *rates[:-1]], strict=True):
-        gap = fast - slow
-        zeros.append(
-            brentq(compliance, slow + 1e-12 * gap, fast - 1e-12 * gap, xtol=1e-15 * fast, rtol=1e-14)
-        )
-    found = np.array(zeros)
-    # The residue of 1 / J at s = -r is 1 / J'(s); that of E_j s tau_j / (1 + s tau_j) is -E_j r.
-    slopes = np.array([-np.sum(parts * rates / (rates - r) ** 2) for r in found])
-    return Branches(np.concatenate([[1 / (instant + np.sum(parts))], -1 / (slopes * found)]), 1 / found)
+    instant, parts = creep.amplitudes[0], creep.amplitudes[1:]
+    v = np.sqrt(parts / creep.times)
+    rates, vectors = np.linalg.eigh(np.diag(1 / creep.times) + np.outer(v, v) / instant)
+    strengths = (v @ vectors / instant) ** 2 / rates
+    order = slice(None, None, -1)  # rates rise, times fall
+    at_rest = 1 / (instant + np.sum(parts))
+    return Branches(np.concatenate([[at_rest], strengths[order]]), 1 / rates[order])

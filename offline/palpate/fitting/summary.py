@@ -15,7 +15,9 @@ DENSITY_KG_PER_M3 = 1060.0
 
 def tissue_text(tissue: Tissue) -> str:
     """The table for the screen, without the material."""
-    rows = [("E at rest", _range(tissue.modulus_pa, "Pa"), "Young's modulus, fully relaxed")]
+    longest = max(record.window_s[1] for record in tissue.records)
+    note = f"what relaxes slower than in {_digits(longest, 2)} s counts as at rest"
+    rows = [("E at rest", _range(tissue.modulus_pa, "Pa"), note)]
     for number, branch in enumerate(tissue.branches, 1):
         rows.append((f"branch {number}", f"gamma {_range(branch.gamma)}", f"tau {_range(branch.tau_s, 's')}"))
     for loss in tissue.loss_tangent:

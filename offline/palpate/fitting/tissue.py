@@ -8,10 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.fitting.branches import Branches, fit_branches
-from palpate.fitting.confidence import Estimate, Interval, correlation_time_of, estimate_of, intervals
+from palpate.fitting.branches import Branches, Fit, fit_branches
+from palpate.fitting.confidence import (
+    Estimate,
+    Interval,
+    correlation_time_of,
+    estimate_of,
+    further_branch,
+    intervals,
+)
 from palpate.fitting.conversion import relaxation_of
-from palpate.fitting.equations import equations_of, stacked
+from palpate.fitting.equations import Equations, equations_of, stacked
 from palpate.fitting.identifiability import missing_data, tells
 from palpate.fitting.records import Record, TimeRecord
 
@@ -20,6 +27,7 @@ Array = NDArray[np.float64]
 HAPTIC_BAND_HZ = (1.0, 10.0, 30.0)
 
 _NOTABLE_CORRELATION_TIME = 1.5  # in samples
+_SIGNIFICANT = 2.58  # standard deviations: by chance in 1 of 200
 
 
 class NotIdentifiable(ValueError):
@@ -90,7 +98,8 @@ def fit_tissue(records: Sequence[Record], partial: bool = False) -> Tissue:
         )
     equations = [equations_of(record) for record in records]
     fits = [fit_branches(part) for part in equations]
-    fit = fits[0] if len(fits) == 1 else fit_branches(stacked(equations, [f.rms for f in fits]))
+    together = equations[0] if len(fits) == 1 else stacked(equations, [f.rms for f in fits])
+    fit = fits[0] if len(fits) == 1 else fit_branches(together)
     correlation = max(
         correlation_time_of(f.residuals) if isinstance(r, TimeRecord) else 1.0
         for f, r in zip(fits, records, strict=True)
@@ -98,7 +107,9 @@ def fit_tissue(records: Sequence[Record], partial: bool = False) -> Tissue:
     estimate, n = estimate_of(fit, correlation), len(fit.branches.times)
 
     at_rest, *rest = intervals(_constants, estimate)
-    missing = tuple(missing_data(records, at_rest, rest[:n], rest[n:]))
+    branches = list(zip(rest[:n], rest[n:], strict=True))
+    beyond = _relaxes_beyond(records, together, fit, correlation)
+    missing = tuple(missing_data(records, at_rest, branches, beyond))
     if missing and not partial:
         raise NotIdentifiable("\n".join(missing))
 
@@ -116,6 +127,17 @@ def fit_tissue(records: Sequence[Record], partial: bool = False) -> Tissue:
         missing,
         tuple(_notes(records, n, correlation)),
     )
+
+
+def _relaxes_beyond(
+    records: Sequence[Record], equations: Equations, fit: Fit, correlation_time: float
+) -> tuple[bool, bool]:
+    """Whether a branch much faster than the records tell would improve the fit, and one much slower."""
+    fastest = min(record.window_s[0] for record in records)
+    slowest = max(record.window_s[1] for record in records)
+    columns = equations.columns(np.array([fastest / 5, slowest * 10]))
+    faster, slower = (further_branch(fit, column, correlation_time) for column in columns[:, 1:].T)
+    return faster > _SIGNIFICANT, slower > _SIGNIFICANT
 
 
 def complex_modulus(branches: Branches, frequency_hz: Array) -> NDArray[np.complex128]:
