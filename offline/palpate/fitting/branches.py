@@ -56,15 +56,16 @@ def fit_branches(equations: Equations) -> Fit:
 
     Non-negative least squares on a grid of time constants gives too many branches, since noise makes some. From these,
     that branch is removed, or those two neighbors are merged, that the record misses least; amplitudes and
-    time constants are refined; and so on, until none is left. BIC = n ln(mean square + SMALLEST_ERROR²) + p ln n
-    (G. Schwarz, Ann. Stat. 6, 1978) of n rows and p parameters chooses among them.
+    time constants are refined; and so on, until none is left or three in a row were no better.
+    BIC = n ln(mean square + SMALLEST_ERROR²) + p ln n (G. Schwarz, Ann. Stat. 6, 1978) of n rows and p parameters
+    chooses among them.
     """
-    fit = _refined(equations, _on_grid(equations))
-    best = fit
-    while len(fit.branches.times):
+    best = fit = _refined(equations, _on_grid(equations))
+    no_better = 0
+    while len(fit.branches.times) and no_better < 3:
         fit = _refined(equations, _one_less(equations, fit.branches))
-        if fit.bic <= best.bic:
-            best = fit
+        no_better = 0 if fit.bic <= best.bic else no_better + 1
+        best = fit if fit.bic <= best.bic else best
     return best
 
 

@@ -25,13 +25,6 @@ def low_passed_ramp(time_s: Array, ramp_s: float, tau_s: float) -> Array:
     return np.where(time_s < ramp_s, rising, held)
 
 
-def modulus_at(
-    frequency_hz: Array, modulus_pa: float, gamma: Sequence[float], tau_s: Sequence[float]
-) -> Array:
-    iw = 2j * np.pi * frequency_hz
-    return modulus_pa * (1 + sum(g * iw * t / (1 + iw * t) for g, t in zip(gamma, tau_s, strict=True)))
-
-
 @pytest.fixture(scope="session")
 def relaxation() -> Callable[..., TimeRecord]:
     """A relaxation with Gaussian noise, a fraction of the largest stress."""

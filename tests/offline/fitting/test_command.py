@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.cli import main
 from palpate.fitting.records import TimeRecord
 from palpate.scene.schema import load_config
 
@@ -95,16 +96,30 @@ def test_json_holds_the_same(folder: Path) -> None:
         (["tissue.csv", "--picture", "tissue.csv"], "tissue.csv is an input of this command"),
     ],
 )
-def test_a_refusal_is_plain_and_has_code_2(folder: Path, arguments: list[str], says: str) -> None:
-    done = palpate("fit", *arguments, folder=folder)
-    assert done.returncode == 2
-    assert says in done.stderr
-    assert "Traceback" not in done.stderr
-    assert done.stdout == ""
+def test_a_refusal_is_plain_and_has_code_2(
+    folder: Path,
+    arguments: list[str],
+    says: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", ["palpate", "fit", *arguments])
+    try:
+        code = main()
+    except SystemExit as ended:  # by argparse
+        code = ended.code  # type: ignore[assignment]
+    printed = capsys.readouterr()
+    assert (code, printed.out) == (2, "")
+    assert says in printed.err
 
 
-def test_what_is_not_known_is_said_in_table_and_material_alike(folder: Path) -> None:
-    done = palpate("fit", "short.csv", "--partial", folder=folder)
-    assert done.returncode == 0, done.stderr
-    assert "  - not known: a hold of " in done.stdout
-    assert "# Not known: a hold of " in done.stdout
+def test_what_is_not_known_is_said_in_table_and_material_alike(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", ["palpate", "fit", "short.csv", "--partial"])
+    assert main() == 0
+    printed = capsys.readouterr().out
+    assert "  - not known: a hold of " in printed
+    assert "# Not known: a hold of " in printed

@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from palpate.fitting.confidence import Interval
 from palpate.fitting.equations import low_passed
 from palpate.fitting.records import ModulusRecord, Signal, TimeRecord, time_record
-from palpate.fitting.tissue import Tissue, fit_tissue
+from palpate.fitting.tissue import NotIdentifiable, Tissue, fit_tissue
 
 MATERIAL = (5400.0, (0.5, 0.3), (1.5, 12.0))
 TIME_S = np.arange(0, 60.5, 0.05)
 
 Make = Callable[..., TimeRecord]
+
+
+def modulus_at(
+    frequency_hz: NDArray[np.float64], modulus_pa: float, gamma: Sequence[float], tau_s: Sequence[float]
+) -> NDArray[np.complex128]:
+    iw = 2j * np.pi * frequency_hz
+    return np.asarray(
+        modulus_pa * (1 + sum(g * iw * t / (1 + iw * t) for g, t in zip(gamma, tau_s, strict=True)))
+    )
 
 
 def constants(tissue: Tissue) -> list[Interval]:
@@ -97,21 +107,20 @@ def test_a_slow_and_a_fast_record_together_tell_what_neither_tells_alone(
 ) -> None:
     material = (1000.0, (0.8, 0.5, 0.4, 0.3), (0.0037, 0.05, 0.6, 8.0))
     f = np.geomspace(0.5, 60, 20)
-    iw = 2j * np.pi * f
-    modulus = 1000 * (1 + sum(g * iw * t / (1 + iw * t) for g, t in zip(*material[1:], strict=True)))
-    slow = relaxation(material, np.arange(0, 40, 0.02), ramp_s=0.2)
-    fast = complex_modulus_record(modulus, f)
-    for alone in (slow, fast):
-        with pytest.raises(ValueError, match="Missing"):
+    exact = modulus_at(f, *material)
+    slow = [relaxation(material, np.arange(0, 40, 0.04), ramp_s=0.2, seed=seed) for seed in range(4)]
+    fast = [complex_modulus_record(exact, f, seed=100 + seed) for seed in range(4)]
+    for alone in (slow[0], fast[0]):
+        with pytest.raises(NotIdentifiable, match="Missing"):
             fit_tissue([alone])
-    tissue = fit_tissue([slow, fast])
-    assert is_covered(tissue, material)
-    for loss in tissue.loss_tangent:
-        (at,) = np.flatnonzero(np.isclose(f, loss.frequency_hz)) if loss.frequency_hz in f else (None,)
-        assert loss.value is not None and at is None
-        w = 2j * np.pi * loss.frequency_hz
-        exact = 1 + sum(g * w * t / (1 + w * t) for g, t in zip(*material[1:], strict=True))
-        assert loss.value.low <= exact.imag / exact.real <= loss.value.high
+    tissues = [fit_tissue(both) for both in zip(slow, fast, strict=True)]
+    # Of 4 with probability 0.95, fewer than 3 have probability 0.014.
+    assert sum(is_covered(tissue, material) for tissue in tissues) >= 3
+    for loss in tissues[0].loss_tangent:
+        modulus = modulus_at(np.array([loss.frequency_hz]), *material)[0]
+        assert loss.value is not None
+        assert loss.value.value == pytest.approx(modulus.imag / modulus.real, rel=0.1)
+        assert loss.value.factor < 1.1
 
 
 def test_a_power_law_tissue_comes_out_as_about_five_branches(
