@@ -105,6 +105,7 @@ def test_a_client_runs_without_numpy() -> None:
     ("arguments", "missing", "extra"),
     [
         (["build", "scene.toml"], "pydantic", "build"),
+        (["fit", "record.csv"], "scipy", "build"),
         (["inspect", "model.npz"], "numpy", "server"),
         (["serve", "model.npz"], "numba", "server"),
         (["check-host"], "numba", "server"),
