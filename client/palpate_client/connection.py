@@ -29,7 +29,7 @@ from palpate_client.messages import (
 )
 
 QUERY_TIMEOUT_S = 3.0
-LONG_QUERY_TIMEOUT_S = 10.0  # for wire.SLOW_ACTIONS
+LONG_QUERY_TIMEOUT_S = 30.0  # for wire.SLOW_ACTIONS
 RETRY_PAUSE_S = 0.05
 
 Subscription = Any  # zenoh.Subscriber: `undeclare()` ends it

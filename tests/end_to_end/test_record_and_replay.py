@@ -143,7 +143,7 @@ def test_whatever_a_client_has_changed_meanwhile_is_repeated_too(
         poke(client, 100, answer["tools"]["tip"]["home_m"])
         assert client.control("reset")[0]
         poke(client, 100, answer["tools"]["tip"]["home_m"])
-        assert client.control("record", file=None)[0]
+        assert client.control("record", file=None)[1]["recording"]["error"] is None
     recorded = assert_all_is_repeated(tmp_path / "a.mcap", served.model, other)
     changes = [settings["change"] for settings in recorded.settings.values()]
     assert changes == ["save", *["limits"] * 5, "frame", "limits", "exchange", "exchange", "reset"]
