@@ -67,7 +67,7 @@ def test_95_of_100_records_recover_the_material(
     material: tuple,
     time_s: np.ndarray,  # type: ignore[type-arg]
 ) -> None:
-    tissues = [fit_tissue([relaxation(material, time_s, seed=seed)], partial=True) for seed in range(100)]
+    tissues = [fit_tissue([relaxation(material, time_s, seed=seed)]) for seed in range(100)]
     assert sum(is_covered(t, material) for t in tissues) >= 95
     # The count can tell: a third of the intervals is too little.
     assert sum(is_covered(t, material, 1 / 3) for t in tissues) < 75
