@@ -79,6 +79,7 @@ SERVER_ROOMS = (
         "bodies",
         "coupling",
     ),  # the loop: the tick calls the coupling, which uses what the loop compiles with
+    "simulation",
     "codec",
     "recording",
     "session",

@@ -62,6 +62,13 @@ class SurfaceAccuracy:
     resolved_frequency_hz: float
     error_map: NDArray[np.float32]
 
+    @staticmethod
+    def unknown(n_points: int) -> SurfaceAccuracy:
+        """The evidence of a model that was not made from a body: not a number."""
+        nan = float("nan")
+        errors = np.full(n_points, nan, np.float32)
+        return SurfaceAccuracy(nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, errors)
+
 
 SURFACE_SCALARS = ("name", "period_s", "n_nodes", "config", "config_sha256", "built_with")
 """The fields of `SurfaceModel` that the metadata of a file states unchanged."""

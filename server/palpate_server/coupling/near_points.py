@@ -1,0 +1,60 @@
+"""Which points of a surface are near each point, along the surface: found once, when a model is loaded."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_server.realtime.compiled import compiled
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+NONE = -1
+
+
+def near_points(points: Floats, triangles: NDArray[np.int32], reach_m: float, most: int) -> Integers:
+    """(n_points, k), k <= most: for each point those within reach_m, nearest first, itself included; NONE beyond them.
+
+    Only points count that edges connect to it within the reach, so that the far side of a thin lobe does not.
+    The nearest `most` are kept where there are more.
+    """
+    starts, neighbors = _adjacency(len(points), triangles)
+    table = np.full((len(points), most), NONE)
+    _fill(np.ascontiguousarray(points, dtype=float), starts, neighbors, reach_m, table)
+    return np.ascontiguousarray(table[:, : max(1, int(np.max(np.sum(table != NONE, axis=1), initial=1)))])
+
+
+def _adjacency(n_points: int, triangles: NDArray[np.int32]) -> tuple[Integers, Integers]:
+    """(n_points + 1,) and (n_edges,): the neighbors of point i are neighbors[starts[i] : starts[i + 1]]."""
+    edges = np.concatenate([triangles[:, [i, j]] for i in range(3) for j in range(3) if i != j]).astype(
+        np.int64
+    )
+    edges = np.unique(edges, axis=0) if len(edges) else edges.reshape(0, 2)
+    starts = np.searchsorted(edges[:, 0], np.arange(n_points + 1))
+    return starts.astype(np.int64), np.ascontiguousarray(edges[:, 1])
+
+
+@compiled
+def _fill(points: Floats, starts: Integers, neighbors: Integers, reach: float, table: Integers) -> None:
+    """Walk over the edges from each point, within the reach."""
+    n = points.shape[0]
+    seen, queue, distance = np.full(n, NONE), np.empty(n, np.int64), np.empty(n)
+    for start in range(n):
+        queue[0], seen[start], distance[0] = start, start, 0.0
+        count, next_one = 1, 0
+        while next_one < count:
+            here = queue[next_one]
+            next_one += 1
+            for e in range(starts[here], starts[here + 1]):
+                other = neighbors[e]
+                if seen[other] == start:
+                    continue
+                seen[other] = start
+                apart = np.sqrt(np.sum((points[other] - points[start]) ** 2))
+                if apart <= reach:
+                    queue[count], distance[count] = other, apart
+                    count += 1
+        order = np.argsort(distance[:count])
+        for k in range(min(count, table.shape[1])):
+            table[start, k] = queue[order[k]]

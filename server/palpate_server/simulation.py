@@ -1,0 +1,192 @@
+"""A surface model stepped in process, without a server: positions of the tools in, forces and contacts out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.model_file import SurfaceModel
+from palpate_client.wire import Flags
+from palpate_server.coupling import sphere_contact
+from palpate_server.coupling.sphere_contact import DEFAULT_STIFFNESS_N_PER_M
+from palpate_server.realtime import native_image
+from palpate_server.realtime.compiled import compiled
+from palpate_server.realtime.native_image import Image, view
+from palpate_server.realtime.records import REACTION
+
+Floats = NDArray[np.float64]
+Records = NDArray[np.void]
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """What a tool feels, and how it touches; energies since the simulation began.
+
+    force_n        (3,), of the tissue on the tool
+    normal         (3,), of the contact, out of the tissue, of length 1; zero without contact
+    penetration_m  of the tool beneath the surface at rest
+    slip_m         of the tool along the tissue in this step
+    n_points       points of the surface in contact
+    flags          IN_CONTACT, SLIDING, ATTACHED
+    work_j, stored_j, dissipated_j  work that the tool did, energy in its coupling spring, energy lost in its contact
+    """
+
+    force_n: Floats
+    normal: Floats
+    penetration_m: float
+    slip_m: float
+    n_points: int
+    flags: Flags
+    work_j: float
+    stored_j: float
+    dissipated_j: float
+
+
+class Simulation:
+    """A body and its tools, which advance by `model.period_s` with each step. The same steps give the same bits.
+
+    Example
+    -------
+    >>> model = load_model("liver.npz")
+    >>> simulation = Simulation(model)
+    >>> tool = model.tools[0]
+    >>> position = np.array(tool.home_m)
+    >>> for _ in range(200):  # 0.2 s
+    ...     position[2] -= 1e-4  # 0.1 m/s downward
+    ...     reaction = simulation.step({tool.name: position})[tool.name]
+    >>> reaction.force_n, reaction.n_points
+    >>> simulation.positions()  # (n_points, 3), the deformed surface
+
+    Parameters
+    ----------
+    model                a surface model
+    stiffness_n_per_m    of the coupling spring between each tool's position and its sphere: of all tools, or by name
+
+    Raises ValueError for a stiffness that is not positive, and for modes above half the sampling rate.
+    """
+
+    def __init__(
+        self, model: SurfaceModel, stiffness_n_per_m: float | Mapping[str, float] = DEFAULT_STIFFNESS_N_PER_M
+    ) -> None:
+        self.model = model
+        self._index = {tool.name: i for i, tool in enumerate(model.tools)}
+        self._contact = sphere_contact.make(model, self._stiffnesses(stiffness_n_per_m))
+        self._image = native_image.make_image(self._contact)
+        n = len(self._index)
+        self._positions = np.array([tool.home_m for tool in model.tools], float).reshape(n, 3)
+        self._wanted = np.full(n, sphere_contact.LIFTED)
+        self._forces, self._reactions = np.zeros((n, 3)), np.zeros(n, REACTION)
+        self._shown = np.zeros(self._contact.shown_size())
+
+    def step(self, positions_m: Mapping[str, Iterable[float]]) -> dict[str, Reaction]:
+        """Move the named tools to positions (3,), m, of their spheres' centers in the model frame, and advance one period.
+
+        A tool that is not named touches nothing. Raises ValueError for an unknown tool or a position that is not three
+        finite numbers; then nothing has changed.
+        """
+        wanted = {self._tool(name): _position(name, values) for name, values in positions_m.items()}
+        for i in range(len(self._index)):
+            if i not in wanted:
+                self._wanted[i] = sphere_contact.LIFTED
+            elif self._wanted[i] == sphere_contact.LIFTED:
+                self._wanted[i] = sphere_contact.TOUCHING
+        for i, position in wanted.items():
+            self._positions[i] = position
+        _advance(self._image, self._positions, self._wanted, self._forces, self._reactions)
+        return {name: self._reaction(self._index[name]) for name in positions_m}
+
+    def attach(self, tool: str) -> None:
+        """From the next step on the tool holds on to the points it presses, or to the first that it will."""
+        self._wanted[self._tool(tool)] = sphere_contact.GRABBING
+
+    def release(self, tool: str) -> None:
+        """From the next step on the tool lets go: what it pulled with fades within some 0.1 s."""
+        self._wanted[self._tool(tool)] = sphere_contact.TOUCHING
+
+    def positions(self) -> Floats:
+        """(n_points, 3), m: the surface as it is now."""
+        _save_shown(self._image, self._shown)
+        return self.model.points + sphere_contact.shown(self.model, self._shown).reshape(-1, 3)
+
+    def energy(self) -> tuple[float, float]:
+        """J, stored in the body, and dissipated in it since the simulation began."""
+        out = np.zeros(2)
+        _ledger(self._image, out)
+        return float(out[0]), float(out[1])
+
+    def save(self) -> Floats:
+        """All that steps change, for `restore` of a simulation of the same model."""
+        state = np.zeros(self._contact.state_size())
+        _save(self._image, state)
+        return state
+
+    def restore(self, state: Floats) -> None:
+        """Continue from a saved state. Raises ValueError for one of another size."""
+        self._contact.restore(state)
+        self._wanted[:] = self._contact.tools.wanted
+
+    def _stiffnesses(self, stiffness: float | Mapping[str, float]) -> list[float]:
+        if isinstance(stiffness, Mapping):
+            for name in stiffness:
+                self._tool(name)
+            values = [float(stiffness.get(name, DEFAULT_STIFFNESS_N_PER_M)) for name in self._index]
+        else:
+            values = [float(stiffness)] * len(self._index)
+        for value in values:
+            if not (value > 0 and np.isfinite(value)):
+                raise ValueError(f"stiffness_n_per_m = {value:g}: expected a positive number")
+        return values
+
+    def _tool(self, name: str) -> int:
+        if name not in self._index:
+            raise ValueError(f"{name!r} is not a tool of the model: expected one of {sorted(self._index)}")
+        return self._index[name]
+
+    def _reaction(self, i: int) -> Reaction:
+        one = self._reactions[i]
+        return Reaction(
+            force_n=self._forces[i].copy(),
+            normal=one["normal"].copy(),
+            penetration_m=float(one["penetration_m"]),
+            slip_m=float(one["slip_m"]),
+            n_points=int(one["n_contact_points"]),
+            flags=Flags(int(one["flags"])),
+            work_j=float(one["work_j"]),
+            stored_j=float(one["stored_j"]),
+            dissipated_j=float(one["dissipated_j"]),
+        )
+
+
+def _position(name: str, values: Iterable[float]) -> Floats:
+    position = np.asarray(values, float)
+    if position.shape != (3,) or not np.all(np.isfinite(position)):
+        raise ValueError(f"position of {name!r} is {values!r}: expected three finite numbers, in m")
+    return position
+
+
+@compiled
+def _advance(
+    image: Image, positions: Floats, wanted: NDArray[np.int64], forces: Floats, reactions: Records
+) -> None:
+    sphere_contact.advance(view(image), positions, wanted, forces, reactions)
+
+
+@compiled
+def _save(image: Image, state: Floats) -> None:
+    sphere_contact.save(view(image), state, 0)
+
+
+@compiled
+def _save_shown(image: Image, state: Floats) -> None:
+    sphere_contact.save_shown(view(image), state)
+
+
+@compiled
+def _ledger(image: Image, out: Floats) -> None:
+    sphere_contact.ledger(view(image), out)
+
+
+native_image.register("sphere_contact", sphere_contact.empty(1))
