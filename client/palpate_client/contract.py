@@ -37,7 +37,9 @@ class Contract:
         self._hold_ns = (description.hold_s + description.period_s) * 1e9
         self._fade_ns = (description.hold_s + description.decay_s) * 1e9
         self._sent: dict[int, int] = {}  # sequence -> client_time_ns, the newest REMEMBERED ones
-        self._newest_answered = -1
+        self._newest_sent = self._newest_answered = -1
+        self._first_of_hold = 0  # the first command since the tool was acquired
+        self._hold_is_answered = False  # whether one of those has been answered
         self._round_trips_ns = array("q")  # an hour at 1 kHz is 29 MB
         self._flag_counts = dict.fromkeys(Flags, 0)
         self._breaks = 0
@@ -49,7 +51,9 @@ class Contract:
     def acquired(self, max_force_n: float) -> None:
         """Call it when `acquire` was granted, with the limit of the force."""
         self._max_force_n = max_force_n
-        self._newest_answered = -1
+        # Forces from before may still come, after the answer to `acquire`: they tell nothing about this hold.
+        self._first_of_hold = self._newest_sent + 1
+        self._hold_is_answered = False
         self.holding = True
 
     def released(self) -> None:
@@ -61,6 +65,7 @@ class Contract:
         if client_time_ns - self._newest_sent_ns > self._fade_ns:
             self._sending_since_ns = client_time_ns
         self._newest_sent_ns = client_time_ns
+        self._newest_sent = sequence
         self._sent[sequence] = client_time_ns
         self.commands_sent += 1
         self._sent.pop(sequence - REMEMBERED, None)
@@ -113,7 +118,7 @@ class Contract:
             self._break(force, f"the input is stale and the force still {magnitude} N")
         if not force.flags & (Flags.DECAYING | Flags.STALE) and force.input_age_ns > self._hold_ns:
             self._break(force, f"the input is {force.input_age_ns / 1e6} ms old and no flag says so")
-        if self.holding and force.sequence < 0 <= self._newest_answered:
+        if self.holding and force.sequence < 0 and self._hold_is_answered:
             # The server keeps a holder's last command, however silent the holder is.
             self._lose(
                 force,
@@ -144,6 +149,7 @@ class Contract:
     def _check_answer(self, force: Force) -> None:
         sent_ns = self._sent.get(force.sequence)
         if sent_ns is not None and sent_ns == force.client_time_ns:
+            self._hold_is_answered |= force.sequence >= self._first_of_hold
             if force.sequence > self._newest_answered:
                 self._newest_answered = force.sequence
                 self.commands_answered += 1

@@ -103,7 +103,9 @@ class Contract {
     // The answer to `acquire` is here: from now on we hold the tool, within these limits.
     void agree(double max_force_n) {
         max_force_n_ = max_force_n;
-        newest_answered_ = -1;
+        // Forces from before may still come, after the answer to `acquire`: they tell nothing about this hold.
+        first_of_hold_ = newest_sent_ + 1;
+        hold_is_answered_ = false;
         holding_ = true;
     }
 
@@ -114,6 +116,7 @@ class Contract {
     void on_sending(std::int64_t sequence, std::int64_t client_time_ns) {
         if (static_cast<double>(client_time_ns - newest_sent_ns_) > fade_ns_) sending_since_ns_ = client_time_ns;
         newest_sent_ns_ = client_time_ns;
+        newest_sent_ = sequence;
         sent_[index(sequence)] = {sequence, client_time_ns};
         ++commands_;
     }
@@ -170,7 +173,7 @@ class Contract {
         if (!(f.flags & (decaying_ | stale_)) && age_ns > hold_ns_) {
             broke(f.tick, "the input is %g ms old and no flag says so", age_ns / 1e6);
         }
-        if (holding_ && f.sequence < 0 && newest_answered_ >= 0) {
+        if (holding_ && f.sequence < 0 && hold_is_answered_) {
             // The server keeps a holder's last command, however silent the holder is.
             lose();
             broke(f.tick,
@@ -205,6 +208,7 @@ class Contract {
         if (f.sequence < 0) return;
         const Sent& sent = sent_[index(f.sequence)];
         if (sent.sequence == f.sequence && sent.client_time_ns == f.client_time_ns) {
+            hold_is_answered_ = hold_is_answered_ || f.sequence >= first_of_hold_;
             if (f.sequence > newest_answered_) {
                 newest_answered_ = f.sequence;
                 ++answered_;
@@ -257,6 +261,8 @@ class Contract {
     bool holding_ = false, in_outage_ = false;
     std::vector<Sent> sent_ = std::vector<Sent>(remembered);
     std::int64_t commands_ = 0, answered_ = 0, forces_ = 0, lost_ticks_ = 0, newest_answered_ = -1, breaks_ = 0;
+    std::int64_t newest_sent_ = -1, first_of_hold_ = 0;  // the first command since the tool was acquired
+    bool hold_is_answered_ = false;                       // whether one of those has been answered
     std::int64_t newest_sent_ns_ = 0,
                  sending_since_ns_ = 0;  // since: without a pause in which our force would fade
     double largest_force_n_ = 0.0;

@@ -152,6 +152,23 @@ def test_a_client_whose_commands_are_forgotten_has_lost_its_tool() -> None:
     assert "tick 200: we no longer hold the tool" in broken
 
 
+def test_forces_from_before_the_tool_was_acquired_again_may_come_after_the_answer_to_that() -> None:
+    said = Conversation()
+    newest = said.go_well(100, 200)
+    answered = said.contract.commands_answered
+    said.contract.released()
+    said.contract.acquired(1.0)
+    said.tick(200, newest)  # on its way since before
+    said.tick(201, -1)  # by now the server has forgotten our commands
+    assert said.contract.commands_answered == answered + 1
+    first = said.send(202)
+    said.tick(203, first)
+    assert said.contract.holding
+    assert not said.contract.broken
+    said.tick(204, -1)
+    assert not said.contract.holding
+
+
 def test_before_the_first_answer_and_after_a_release_no_command_of_ours_is_known_rightly() -> None:
     said = Conversation()
     said.send(100)

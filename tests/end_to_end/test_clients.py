@@ -50,7 +50,7 @@ Connection._join = joined
 def server_is_gone():
     return connections[0]._stopping.is_set() and connections[0]._gone.is_set()
 def spied(device, force_n):
-    print(-1e-3 * device.z_mm, force_n[2], file=forces)
+    forces.write("%r %r\\n" % (-1e-3 * device.z_mm, force_n[2]))  # at once, whenever a signal comes
     render(device, force_n)
     while force_n[2] and "HOLD_UP" in os.environ and not go_on.exists():
         time.sleep(0.005)

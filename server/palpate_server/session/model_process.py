@@ -26,7 +26,7 @@ from palpate_server.coupling.models import Model
 _TIMEOUT_S = 60.0
 _POLL_S = 0.01
 _MOST_MEMORY_BYTES = 4 * 2**30
-_NICE = 10  # the loop and its threads come first
+_NICE = 5  # after the loop and its threads; at 10, two busy loops leave a load too little time to be answered
 _EXIT_REFUSED = 2
 _ALIGNMENT = 64
 _HEAD = struct.Struct("<QQ")  # bytes of the pickle, number of arrays; then the bytes of each array as <Q
