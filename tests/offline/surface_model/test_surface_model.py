@@ -227,11 +227,11 @@ def test_as_many_modes_are_kept_as_the_tolerance_needs_and_not_many_more(
         )
         return float(evidence.error_bound(met.of(sample.points), LIVER.prony, frequencies).max())
 
-    assert error(modes) <= 0.85 * tolerance * 1.001
+    assert error(modes) <= 0.9 * tolerance * 1.001
     fewer = int(0.7 * len(modes.squared_frequencies))
     if modes.squared_frequencies[fewer - 1] > 1.1 * (2 * np.pi * 15) ** 2:
         less = LowestModes(modes.squared_frequencies[:fewer], modes.parameters[:, :fewer])
-        assert error(less) > 0.85 * tolerance
+        assert error(less) > 0.9 * tolerance
 
 
 def test_a_tolerance_out_of_reach_is_refused(block: Block) -> None:
@@ -243,7 +243,7 @@ def test_a_tolerance_out_of_reach_is_refused(block: Block) -> None:
 def test_the_number_of_modes_is_guessed_to_a_factor_of_two(block: Block) -> None:
     every = np.sqrt(elastic_modes(block.body).squared_frequencies) / (2 * np.pi)
     guess = guessed_modes(LIVER, 0.06 * 0.048 * 0.036, 2 * (0.06 * 0.048 + 0.108 * 0.036), 30.0, 0.05)
-    assert 0.5 < guess / np.count_nonzero(every < 45.0) < 2
+    assert 0.5 < guess / np.count_nonzero(every < 2.4 * 30) < 2
 
 
 def test_a_footprint_spreads_a_unit_force_as_the_pressure_of_hertz() -> None:

@@ -1,0 +1,162 @@
+"""A scene with a tool becomes a surface model: the whole chain against finite elements, and what it warns of and refuses."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import skfem
+from skfem.helpers import ddot, eye, sym_grad, trace
+
+from palpate.build_surface import build_surface_model
+from palpate.model_file import SurfaceModel, load_model, save_model
+from palpate.report import accuracy_text
+from palpate.scene.material import PRESETS
+from palpate.scene.schema import check_config
+
+SIDE_M, HEIGHT_M, RADIUS_M = 0.06, 0.04, 0.016
+
+SCENE: dict[str, Any] = tomllib.loads(f"""
+name = "block"
+[geometry]
+shape = "box"
+upper_m = [{SIDE_M}, {SIDE_M}, {HEIGHT_M}]
+counts = [9, 9, 7]
+[material]
+preset = "liver"
+[[fixed]]
+region = "plane"
+point_m = [0.0, 0.0, 0.001]
+normal = [0.0, 0.0, -1.0]
+[surface]
+modes = 60
+band_hz = [0.0, 15.0]
+[[tool]]
+name = "tip"
+radius_m = {RADIUS_M}
+friction = 0.3
+""")
+
+
+class _Progress:
+    def __init__(self) -> None:
+        self.stages: list[str] = []
+        self.warnings: list[str] = []
+
+    def __call__(self, stage: str) -> None:
+        self.stages.append(stage)
+
+    def note(self, text: str) -> None:
+        pass
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
+
+
+@pytest.fixture(scope="module")
+def built() -> tuple[SurfaceModel, _Progress]:
+    progress = _Progress()
+    return build_surface_model(check_config(SCENE, "block"), Path(), progress), progress
+
+
+def _compliance_by_finite_elements(contact_radius_m: float) -> float:
+    """Work-conjugate displacement under the pressure of Hertz on the middle of the top, over its force, m/N.
+
+    Quadratic hexahedra on a quarter of the block, graded towards the contact.
+    """
+    across = SIDE_M / 2 * np.linspace(0, 1, 6) ** 1.3
+    mesh = skfem.MeshHex.init_tensor(across, across, HEIGHT_M * (1 - np.linspace(1, 0, 6) ** 1.3))
+    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementHex2()), intorder=4)
+    material = PRESETS["liver"]
+    lame, mu = material.lame_lambda_pa, material.shear_modulus_pa
+
+    @skfem.BilinearForm
+    def stiffness(u: Any, v: Any, w: Any) -> Any:
+        strain = sym_grad(u)
+        return ddot(2 * mu * strain + eye(lame * trace(strain), 3), sym_grad(v))
+
+    @skfem.LinearForm
+    def pressure(v: Any, w: Any) -> Any:
+        squared = (w.x[0] ** 2 + w.x[1] ** 2) / contact_radius_m**2
+        return 3 / (2 * np.pi * contact_radius_m**2) * np.sqrt(np.maximum(0, 1 - squared)) * v[2]
+
+    top = skfem.FacetBasis(
+        mesh, basis.elem, facets=mesh.facets_satisfying(lambda x: np.isclose(x[2], HEIGHT_M)), intorder=8
+    )
+    load = pressure.assemble(top)
+    held = np.concatenate(
+        [
+            basis.get_dofs(lambda x: np.isclose(x[2], 0.0)).all(),
+            basis.get_dofs(lambda x: np.isclose(x[0], 0.0)).all(["u^1"]),
+            basis.get_dofs(lambda x: np.isclose(x[1], 0.0)).all(["u^2"]),
+        ]
+    )
+    solution = skfem.solve(*skfem.condense(stiffness.assemble(basis), load, D=np.unique(held)))
+    force = 4 * load[basis.get_dofs(elements=True).all(["u^3"])].sum()
+    return float(4 * load @ solution / force**2)
+
+
+def test_a_block_is_as_compliant_as_by_finite_elements(built: tuple[SurfaceModel, _Progress]) -> None:
+    model, _ = built
+    middle = int(np.argmin(np.linalg.norm(model.points - [SIDE_M / 2, SIDE_M / 2, HEIGHT_M], axis=1)))
+    radius = model.accuracy.contact_radius_m
+    distance = np.linalg.norm(model.points - model.points[middle], axis=1)
+    weights = np.sqrt(np.maximum(0, 1 - (distance / radius) ** 2))
+    weights /= weights.sum()
+    vertical = slice(2, None, 3)
+    modal = (weights @ model.shapes[:, 2]) ** 2 @ (1 / model.squared_frequencies)
+    found = modal + weights @ model.residual[vertical, vertical] @ weights
+    # Nine points, 7.5 mm apart, stand for the contact; the pressure of Hertz with their mean of r², 2/5 a², is wider.
+    effective = float(np.sqrt(weights @ distance**2 / 0.4))
+    assert found == pytest.approx(_compliance_by_finite_elements(effective), rel=0.1)
+
+
+def test_the_model_is_judged_written_read_and_told(
+    built: tuple[SurfaceModel, _Progress], tmp_path: Path
+) -> None:
+    model, progress = built
+    accuracy = model.accuracy
+    assert accuracy.error_static < 1e-4
+    assert 0 < accuracy.error_in_band_median <= accuracy.error_in_working_area <= accuracy.error_in_band < 1
+    assert accuracy.error_in_band == pytest.approx(float(accuracy.error_map.max()))
+    assert min(accuracy.passivity_margin, accuracy.passivity_margin_sampled) >= 0
+    assert not accuracy.error_map[model.held].any()
+    assert np.all(accuracy.error_map[~model.held] > 0)
+    save_model(model, tmp_path / "block.npz")
+    read = load_model(tmp_path / "block.npz")
+    assert isinstance(read, SurfaceModel)
+    np.testing.assert_array_equal(read.residual, model.residual)
+    text = accuracy_text(read, verbose=True)
+    assert "322 points to touch, 60 modes" in text
+    assert "never given out" in text
+    assert not progress.warnings
+    assert progress.stages[-3:] == ["modes", "residual flexibility", "evidence"]
+
+
+def test_another_prony_series_changes_nothing_but_itself() -> None:
+    """Shapes, frequencies and residual belong to the elastic body."""
+    small = SCENE | {"geometry": SCENE["geometry"] | {"counts": [5, 5, 4]}}
+    slow = small | {"material": {"preset": "liver", "gamma": [2.0], "tau_s": [0.05]}}
+    one, other = (build_surface_model(check_config(s, "block"), Path()) for s in (small, slow))
+    np.testing.assert_array_equal(one.residual, other.residual)
+    np.testing.assert_array_equal(one.shapes, other.shapes)
+    assert other.gamma.tolist() == [2.0]
+
+
+def test_a_tool_that_is_too_small_for_the_points_is_warned_of_with_its_number() -> None:
+    tool = SCENE["tool"][0] | {"radius_m": 0.004}
+    scene = SCENE | {"geometry": SCENE["geometry"] | {"counts": [5, 5, 4]}, "tool": [tool]}
+    progress = _Progress()
+    build_surface_model(check_config(scene, "block"), Path(), progress)
+    assert any("tool 'tip': radius_m = 0.004 touches about 0.1" in text for text in progress.warnings)
+
+
+def test_modes_that_end_within_the_band_are_refused() -> None:
+    scene = SCENE | {"geometry": SCENE["geometry"] | {"counts": [5, 5, 4]}, "surface": {"modes": 2}}
+    with pytest.raises(
+        ValueError, match=r"surface\.modes = 2 reach .* Hz: expected modes beyond the end of surface\.band_hz"
+    ):
+        build_surface_model(check_config(scene, "block"), Path())
