@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
 from typing import NamedTuple
 
@@ -67,7 +68,9 @@ def _run(name: str, command: Command) -> int:
     try:
         function = getattr(importlib.import_module(command.module), command.function)
         with interrupts.raised():
-            return int(function() or 0)
+            code = int(function() or 0)
+            sys.stdout.flush()
+            return code
     except KeyboardInterrupt:
         return interrupts.end()
     except ModuleNotFoundError as error:
@@ -76,6 +79,9 @@ def _run(name: str, command: Command) -> int:
             raise
         extra = f"palpate[{command.extra}]" if command.extra else "palpate"
         return _fail(f"{name} needs the package {package}, which is not installed: pip install '{extra}'")
+    except BrokenPipeError:  # the reader of our output, such as `head`, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at exit
+        return 128 + signal.SIGPIPE
     except (ValueError, OSError, MemoryError) as error:
         if os.environ.get("PALPATE_TRACEBACK"):
             raise

@@ -85,6 +85,23 @@ def test_inspect_prints_what_the_file_states(slab: tuple[Path, str]) -> None:
     assert palpate("inspect", "slab.npz", folder=folder).returncode == 0
 
 
+def test_a_reader_that_stops_reading_ends_the_command_without_a_message(slab: tuple[Path, str]) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "palpate", "inspect", "slab.npz"],
+            cwd=slab[0],
+            stdout=writing,
+            stderr=subprocess.PIPE,
+            timeout=240,
+            check=False,
+        )
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+
+
 def test_the_same_configuration_builds_the_same_evidence(slab: tuple[Path, str]) -> None:
     folder, _ = slab
     assert palpate("build", "slab.toml", "-o", "again.npz", folder=folder).returncode == 0
