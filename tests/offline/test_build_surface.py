@@ -160,3 +160,15 @@ def test_modes_that_end_within_the_band_are_refused() -> None:
         ValueError, match=r"surface\.modes = 2 reach .* Hz: expected modes beyond the end of surface\.band_hz"
     ):
         build_surface_model(check_config(scene, "block"), Path())
+
+
+def test_a_body_that_does_not_fit_is_refused_before_it_is_assembled(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**16}  # 256 MiB
+    monkeypatch.setattr("palpate.build_surface.os.sysconf", sizes.__getitem__)
+    progress = _Progress()
+    with pytest.raises(
+        MemoryError,
+        match=r"567 nodes, 322 of them on the surface, needs about 0\.\d GiB, this machine has 0\.2",
+    ):
+        build_surface_model(check_config(SCENE, "block"), Path(), progress)
+    assert progress.stages == ["node cloud"]
