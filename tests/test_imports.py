@@ -45,6 +45,7 @@ LAZY = {("palpate.cli", "palpate_paper.reproduce"), ("palpate.commands", "palpat
 
 ROOMS = (
     "files",
+    "memory",
     "progress",
     "interrupts",
     ("model_file", "lti.pole_residue"),  # the file holds a linear system: on one level
@@ -58,8 +59,12 @@ ROOMS = (
     "lti",
     "reduction",
     "surface_model",
+    "stage_cache",
+    "stage_keys",
+    "expected",
     "build",
     "build_surface",
+    "bank",
     "report",
     "plots",
     "fitting",

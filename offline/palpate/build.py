@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from palpate.discretization import collocation, conservative
 from palpate.discretization.assembled_body import AssembledBody
 from palpate.discretization.resolution import resolved_frequency_hz
+from palpate.expected import expected_size, require_memory
 from palpate.factorization import solver_name
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.regions import ContactPatch
@@ -21,9 +22,11 @@ from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.lti.sampling import Sampling
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.model_file import Contact, ReducedModel, Surface
-from palpate.modes.body_modes import body_modes, by_ritz, require_memory
+from palpate.modes.body_modes import by_ritz, ritz_body_modes
+from palpate.modes.dense import elastic_modes
 from palpate.modes.elastic_modes import ElasticModes
-from palpate.progress import NO_PROGRESS, Progress
+from palpate.modes.ritz import StaticSpace
+from palpate.progress import NO_PROGRESS, Progress, Warnings
 from palpate.reduction.accuracy import measure, refuse_meaningless
 from palpate.reduction.methods import Reduction, reduce
 from palpate.reduction.passive import RitzSubspace, passive
@@ -32,6 +35,8 @@ from palpate.scene.material import Material
 from palpate.scene.plausibility import plausibility
 from palpate.scene.schema import Config, ReductionTable, canonical_text, fingerprint
 from palpate.scene_cloud import build_cloud, contact_patches, fixed_nodes, shown_surface
+from palpate.stage_cache import NO_CACHE, StageCache
+from palpate.stage_keys import StageKeys, stage_keys
 
 Array = NDArray[np.float64]
 
@@ -58,6 +63,7 @@ class FullModel:
     """The whole body before reduction.
 
     patches  of the contacts, in the order of the inputs
+    body     assembled in unit constants, E = 1 Pa and rho = 1 kg/m³; all that follows is in the material's
     change_over_last_vectors  of the force in the band, by the last 60 Ritz vectors of a patch, relative; 0 for all modes
     system   from patch displacement (m) to reaction force (N), exact in time for the assembled body
     """
@@ -71,14 +77,18 @@ class FullModel:
     system: PoleResidueSystem
 
 
-def build_model(config: Config, folder: Path, progress: Progress = NO_PROGRESS) -> ReducedModel:
+def build_model(
+    config: Config, folder: Path, progress: Progress = NO_PROGRESS, cache: StageCache = NO_CACHE
+) -> ReducedModel:
     """Build, reduce and judge the scene; files in it are relative to `folder`.
+
+    cache  of the node cloud, the assembled body and its modes: what is in it is not computed again
 
     Raises FileNotFoundError or ValueError (ConfigError, SurfaceError, RegionError, SupportError, ReductionError) with
     what is wrong; MemoryError when the body has too many nodes for this machine.
     """
     digest = fingerprint(config, folder)
-    full = build_full_model(config, folder, progress)
+    full = build_full_model(config, folder, progress, cache)
     reduction, running, surface, surface_error = _reduce_with_surface(full, config, progress)
     discrete = to_block_form(running)
     progress("accuracy")
@@ -113,12 +123,16 @@ def build_model(config: Config, folder: Path, progress: Progress = NO_PROGRESS) 
     )
 
 
-def build_full_model(config: Config, folder: Path, progress: Progress = NO_PROGRESS) -> FullModel:
-    """Everything up to the reduction. Raises as `build_model`."""
+def build_full_model(
+    config: Config, folder: Path, progress: Progress = NO_PROGRESS, cache: StageCache = NO_CACHE
+) -> FullModel:
+    """Everything up to the reduction. Arguments and errors as `build_model`."""
     material = config.material.material()
+    keys = stage_keys(config, folder)
+    require_memory(expected_size(config, folder))
     progress("node cloud")
-    cloud = build_cloud(config, folder, progress)
-    for text in plausibility(config, float(np.max(np.ptp(cloud.points, axis=0)))):
+    cloud, warnings = cache.kept("cloud", keys.cloud, lambda: _cloud(config, folder))
+    for text in (*warnings, *plausibility(config, float(np.max(np.ptp(cloud.points, axis=0))))):
         progress.warn(text)
     fixed = fixed_nodes(config, cloud)
     patches = contact_patches(config, cloud, fixed)
@@ -127,24 +141,44 @@ def build_full_model(config: Config, folder: Path, progress: Progress = NO_PROGR
         f"{' + '.join(str(len(p.nodes)) for p in patches)} in contact"
     )
 
-    n_free = cloud.n_nodes - len(fixed) - sum(len(p.nodes) for p in patches)
-    symmetric = config.discretization.method == "conservative"
-    require_memory(cloud.n_nodes, n_free, len(patches), symmetric, config.discretization.support_radius)
     progress(f"assembly, {config.discretization.method}")
     assemble = _ASSEMBLE[config.discretization.method]
-    body = assemble(cloud, material, fixed, [p.nodes for p in patches], config.discretization.support_radius)
+    nodes, radius = [p.nodes for p in patches], config.discretization.support_radius
+    body = cache.kept("body", keys.body, lambda: assemble(cloud, material.unit, fixed, nodes, radius))
     progress.note(f"{body.stiffness.nnz / body.stiffness.shape[0]:.0f} nonzeros a row")
 
     progress(_modes_stage(body))
-    found = body_modes(body, material.prony, config.reduction.band_hz[1])
-    modes = found.modes
+    modes, change = _modes(body, config, keys, cache)
     frequencies = np.sqrt(np.abs(modes.squared_frequencies)) / (2 * np.pi)
     progress.note(f"{modes.n_modes:,} modes from {frequencies.min():.3g} to {frequencies.max():.3g} Hz")
 
     progress("viscoelastic system")
     system = viscoelastic_system(modes, material.prony)
     progress.note(f"{system.n_states:,} states")
-    return FullModel(cloud, material, patches, body, modes, found.change, system)
+    return FullModel(cloud, material, patches, body, modes, change, system)
+
+
+def _cloud(config: Config, folder: Path) -> tuple[NodeCloud, tuple[str, ...]]:
+    """The node cloud, and the warnings that its making gave."""
+    heard = Warnings()
+    cloud = build_cloud(config, folder, heard)
+    return cloud, tuple(heard.texts)
+
+
+def _modes(
+    body: AssembledBody, config: Config, keys: StageKeys, cache: StageCache
+) -> tuple[ElasticModes, float]:
+    """The modes in the material's constants, and the change of the force by the last of them."""
+    material = config.material.material()
+    if not by_ritz(body.n_nodes, body.symmetric):
+        unit = cache.kept("modes", keys.modes, lambda: elastic_modes(body))
+        return unit.scaled(material.youngs_modulus_pa, material.density_kg_per_m3), 0.0
+    with cache.alone("modes", keys.modes):
+        known: StaticSpace | None = cache.load("modes", keys.modes)
+        found = ritz_body_modes(body, material, config.reduction.band_hz[1], known)
+        if found.space is not known:
+            cache.store("modes", keys.modes, found.space)
+    return found.modes, found.change
 
 
 def _modes_stage(body: AssembledBody) -> str:

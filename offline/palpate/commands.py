@@ -9,9 +9,13 @@ import math
 import time
 from importlib.resources import files
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from palpate import interrupts
 from palpate.stages import stage_reporter
+
+if TYPE_CHECKING:
+    from palpate.stage_cache import StageCache
 
 
 def build() -> None:
@@ -30,6 +34,12 @@ def build() -> None:
     stop.add_argument(
         "--tolerance", help="largest relative force error in the haptic band, such as 0.02 or 2%%"
     )
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="say how many nodes, how much time and memory, and build nothing",
+    )
+    add_cache_options(parser)
     parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")
     options = parser.parse_args()
 
@@ -41,6 +51,11 @@ def build() -> None:
 
     tolerance = None if options.tolerance is None else parse_tolerance(options.tolerance)
     scene = override_reduction(load_config(options.scene), options.method, options.order, tolerance)
+    if options.dry_run:
+        from palpate.expected import expectation_text
+
+        print(expectation_text(scene, options.scene.parent))
+        return
     path = options.output or Path(f"{scene.name}.npz")
     inputs = [options.scene]
     if surface := getattr(scene.geometry, "file", None):
@@ -53,12 +68,61 @@ def build() -> None:
             from palpate.build import build_model
             from palpate.build_surface import build_surface_model
 
-        build_kind = build_surface_model if scene.tool else build_model
-        model = build_kind(scene, options.scene.parent, stages)
+        model = (
+            build_surface_model(scene, options.scene.parent, stages)
+            if scene.tool
+            else build_model(scene, options.scene.parent, stages, chosen_cache(options))
+        )
         interrupts.check()
     save_model(model, path, inputs)
     print(accuracy_text(model, options.verbose))
     print(f"\nwrote {path} ({path.stat().st_size / 2**20:.1f} MiB) in {time.monotonic() - start:.0f} s")
+
+
+def add_cache_options(parser: argparse.ArgumentParser) -> None:
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        "--cache",
+        type=Path,
+        metavar="DIR",
+        help="folder for finished stages (default: palpate in $XDG_CACHE_HOME or ~/.cache; at most 8 GiB)",
+    )
+    where.add_argument("--no-cache", action="store_true", help="compute every stage, keep none")
+
+
+def chosen_cache(options: argparse.Namespace) -> StageCache:
+    """Raises OSError where the folder can't be made or written to."""
+    from palpate.stage_cache import NO_CACHE, StageCache, default_folder
+
+    return NO_CACHE if options.no_cache else StageCache.open(options.cache or default_folder())
+
+
+def bank() -> None:
+    """Build several scenes, such as materials or orders of one organ; stages that they share are computed once."""
+    parser = argparse.ArgumentParser(description=bank.__doc__)
+    parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE")
+    parser.add_argument(
+        "--out", type=Path, default=Path("bank"), help="folder for the models, NAME.npz each (%(default)s)"
+    )
+    parser.add_argument(
+        "--executor",
+        default="processes",
+        help="threads, processes or dask://ADDRESS of a Dask scheduler (%(default)s)",
+    )
+    parser.add_argument("--workers", type=int, default=2, help="at once, not with Dask (%(default)s)")
+    add_cache_options(parser)
+    options = parser.parse_args()
+    if options.workers < 1:
+        parser.error(f"--workers {options.workers}: expected at least 1")
+    from palpate.bank import build_bank
+
+    cache = chosen_cache(options)
+    with stage_reporter() as stages:
+        stages(f"{len(options.scenes)} scenes")
+        for built in build_bank(options.scenes, options.out, cache, options.executor, options.workers):
+            interrupts.check()
+            stages(f"{built.path}")
+            stages.note(f"{built.n_states} states, force error in band {100 * built.error_in_band:.2g} %")
 
 
 def parse_tolerance(text: str) -> float:

@@ -28,5 +28,15 @@ class _NoProgress:
         pass
 
 
+class Warnings(_NoProgress):
+    """Keeps the warnings and shows nothing."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def warn(self, text: str) -> None:
+        self.texts.append(text)
+
+
 NO_PROGRESS: Progress = _NoProgress()
 """Shows nothing."""

@@ -104,7 +104,7 @@ def _figures(model: ReducedModel) -> Rows:
         ("error at 0 Hz", percent(accuracy.error_static), "static force"),
         ("error in time", percent(accuracy.error_time_domain), "force during a poke, of the largest force"),
         ("error of the surface", percent(accuracy.error_surface_in_band), f"displacement, largest in the band, against the full model's {model.n_states_full:,} states"),
-        ("gain above the band", f"{accuracy.gain_above_band:.3g}", "largest force over the full model's, up to half the sampling rate"),
+        ("gain above the band", f"{accuracy.gain_above_band:.3g}", "largest force over the full model's smoothed one, up to half the sampling rate"),
         ("full model converged", "all modes" if accuracy.change_over_last_vectors == 0 else percent(accuracy.change_over_last_vectors), "change of its force in the band by its last vectors"),
         ("error, H-infinity", percent(accuracy.error_hinf), "largest over all frequencies, of the largest response; far above the band it may be 100 %"),
         ("bound, H-infinity", bound, "what the method guarantees beforehand"),

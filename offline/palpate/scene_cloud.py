@@ -56,7 +56,7 @@ def build_cloud(config: Config, folder: Path, progress: Progress = NO_PROGRESS) 
             for note in loaded.notes:
                 progress.warn(note)
             areas = _working_areas(config, loaded.surface)
-            return fill_surface(loaded.surface, spacing, _refinements(config), areas)
+            return fill_surface(loaded.surface, spacing, refinements(config), areas)
 
 
 def fixed_nodes(config: Config, cloud: NodeCloud) -> Indices:
@@ -90,11 +90,11 @@ def contact_patches(config: Config, cloud: NodeCloud, fixed: Indices) -> tuple[C
 
 def shown_surface(config: Config, cloud: NodeCloud) -> TriangleSurface:
     """The body's surface with triangles small enough near refined contacts to show a dimple."""
-    refinements = _refinements(config)
-    if not refinements or not isinstance(config.geometry, SurfaceGeometry):
+    refined = refinements(config)
+    if not refined or not isinstance(config.geometry, SurfaceGeometry):
         return cloud.surface
     spacing = config.geometry.spacing_m
-    field = SpacingField(spacing, refinements)
+    field = SpacingField(spacing, refined)
     corners = cloud.surface.vertices[cloud.surface.triangles]
     longest = float(np.max(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)))
     return refine_surface(
@@ -159,7 +159,7 @@ def _working_areas(config: Config, surface: TriangleSurface) -> tuple[RefinedAre
     return (RefinedArea(samples.points[inside], area, spacing, config.geometry.growth),)
 
 
-def _refinements(config: Config) -> tuple[Refinement, ...]:
+def refinements(config: Config) -> tuple[Refinement, ...]:
     """Finer nodes around every contact that asks for them, on rings so that its outline is round."""
     if not isinstance(config.geometry, SurfaceGeometry):
         return ()

@@ -24,7 +24,7 @@ from palpate.geometry.sharp_edges import sharp_edges
 from palpate.geometry.spacing import RefinedArea, Refinement, SpacingField
 from palpate.geometry.tributary import nearest_node, tributary_cells, tributary_measures
 from palpate.geometry.visibility import Gaps, find_gaps
-from palpate.scene.quantities import MAX_NODES
+from palpate.memory import machine_memory
 
 Array = NDArray[np.float64]
 
@@ -35,6 +35,9 @@ _DISC = {1: 0.75, 2: 0.81, 3: 0.86}
 """Distance over spacing at which points dropped at random until none fits have 1 node per spacing^dimension."""
 
 _RELAXATIONS = 12
+
+_BYTES_A_NODE = 50_000
+"""Memory of the samples, 8³ a node, while the shares are measured."""
 
 
 def fill_surface(
@@ -116,10 +119,12 @@ def _check_spacing(surface: TriangleSurface, field: SpacingField) -> None:
     fine = sum(min(volume, 4 / 3 * np.pi * r.radius_m**3) / r.spacing_m**3 for r in field.refinements)
     fine += sum(a.area_m2 / a.spacing_m**2 * (1 + 1 / a.growth) / 2 for a in field.areas)
     estimate = volume / spacing_m**3 + fine
-    if estimate > MAX_NODES:
+    needed, present = _BYTES_A_NODE * estimate, machine_memory()
+    if needed > present:
         raise ValueError(
             f"spacing_m = {spacing_m} would give some {estimate:.2g} nodes in a body of "
-            f"{' x '.join(f'{e:.3g}' for e in extent)} m, expected at most {MAX_NODES:,}"
+            f"{' x '.join(f'{e:.3g}' for e in extent)} m, whose samples alone need {needed / 2**30:.2g} GiB: this machine has "
+            f"{present / 2**30:.2g}; expected a larger spacing"
         )
 
 

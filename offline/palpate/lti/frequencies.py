@@ -11,6 +11,9 @@ from palpate.lti.pole_residue import PoleResidueSystem
 
 Array = NDArray[np.float64]
 
+_SMOOTHING = 0.1
+"""Half width of the mean over frequencies, over the frequency."""
+
 
 def band_frequencies(systems: tuple[PoleResidueSystem, ...], band_hz: tuple[float, float]) -> Array:
     """`frequencies_near` the poles of all the systems."""
@@ -79,3 +82,16 @@ def relative_errors(full: NDArray[np.complex128] | Array, other: NDArray[np.comp
     """
     error, gain = spectral_norms(full - other), spectral_norms(full)
     return np.divide(error, gain, out=np.where(error > 0, np.inf, 0.0), where=gain > 0)
+
+
+def smoothed_response(system: PoleResidueSystem, omega: Array, band_end: float) -> NDArray[np.complex128]:
+    """(n, n_outputs, n_inputs): F at s = omega (j + gamma), omega (n,) and band_end in rad/s.
+
+    gamma is 0 in the band and grows to 0.1 at twice its end and beyond: the mean of F over about a tenth of the frequency,
+    by a Lorentzian, since F has no poles in the right half plane. Far above the band the narrow peaks and dips of a full
+    model are those of its nodes and vectors: two sets of vectors of one body differ there by up to several times
+    the force, and by some per cent once it is smoothed (docs/validation.md).
+    """
+    octaves = np.log2(np.maximum(omega, band_end) / band_end)
+    gamma = _SMOOTHING * np.minimum(octaves, 1.0)
+    return system.transfer(omega * (1j + gamma))

@@ -113,6 +113,7 @@ class AccuracyReport:
     error_time_domain      on a poke: largest force error over the largest force, discrete model against exact response
     error_surface_in_band  surface displacement in the band: largest over the frequencies of |error| over |displacement|
     gain_above_band        largest |F| / |F_full| from the band's end to half the sampling rate, F being the discrete model
+                           and F_full smoothed over a tenth of the frequency (`palpate.lti.frequencies.smoothed_response`)
     change_over_last_vectors  largest relative change of the full model's force in the band by the last of the vectors that it
                            was projected on; 0 where it has all modes
     spectral_abscissa      largest real part of the reduced poles, 1/s

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,3 +48,15 @@ class ElasticModes:
         """(n_outputs, n_inputs), N/m: what a hand feels when it stays, K_tt - sum_k c_k b_k^T / mu_k."""
         scaled = self.input_coupling / self.squared_frequencies[:, None]
         return np.real(self.direct_stiffness - self.output_coupling @ scaled)
+
+    def scaled(self, youngs_modulus_pa: float, density_kg_per_m3: float) -> ElasticModes:
+        """The modes of a body of this E and rho from those with E = 1 Pa, rho = 1 kg/m³ and the same Poisson's ratio."""
+        stiffer, lighter = youngs_modulus_pa, density_kg_per_m3**-0.5
+        return replace(
+            self,
+            squared_frequencies=stiffer * lighter**2 * self.squared_frequencies,
+            input_coupling=stiffer * lighter * self.input_coupling,
+            output_coupling=stiffer * lighter * self.output_coupling,
+            direct_stiffness=stiffer * self.direct_stiffness,
+            parameters=lighter * self.parameters,
+        )

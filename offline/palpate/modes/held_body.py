@@ -4,7 +4,7 @@ Shape functions do not interpolate, so nodes are held by constraints C U = 0 on 
 Two matrices serve them, both symmetric and sparse: K with a penalty, K + Cᵀ W C, which has the sparsity of K, and C Cᵀ.
 With P = I - Cᵀ (C Cᵀ)⁻¹ C, the projection onto C U = 0, P (K + Cᵀ W C)⁻¹ P is the inverse of P K P up to the compliance of
 the penalty, a few parts in a million. A solution that is corrected once more by its residual P (f - K U) is exact to
-round-off, and so are the constraints always. With a shift sigma all this holds for K + sigma M, M = Hᵀ m H.
+round-off, and so are the constraints always.
 """
 
 from __future__ import annotations
@@ -30,39 +30,57 @@ _MOST_CORRECTIONS = 6
 
 
 @dataclass(frozen=True)
+class Constraints:
+    """Some nodes are held: C U = 0.
+
+    nodes   (n_held,), the held nodes
+    matrix  (c n_held, c n_nodes), C: their values from the parameters
+    gram    the factor of C Cᵀ of one component
+    """
+
+    nodes: Indices
+    matrix: csr_array
+    gram: SymmetricFactor
+
+    @classmethod
+    def of(cls, body: AssembledBody, nodes: Indices) -> Constraints:
+        """Raises LinAlgError where the shape functions of two of the nodes are the same."""
+        rows = body.basis.value[nodes]
+        matrix = csr_array(kron(rows, eye_array(body.n_components), format="csr"))
+        return cls(nodes, matrix, factorize(csr_array(rows @ rows.T)))
+
+    def project(self, parameters: Array) -> Array:
+        """P U: the parameters (c n_nodes, k) nearest to the given ones that hold the nodes; also P f of loads."""
+        held = self.matrix @ parameters
+        multipliers = self.gram.solve(held.reshape(len(self.nodes), -1)).reshape(held.shape)
+        return parameters - self.matrix.T @ multipliers
+
+
+@dataclass(frozen=True)
 class HeldBody:
     """A symmetric body with the values of some nodes held at zero.
 
     body         the nodes that are held here need not be those of body.supports
-    nodes        (n_held,), the held nodes
-    shift        sigma, (rad/s)², not negative
-    constraints  (c n_held, c n_nodes), C: their values from the parameters
-    factor       of K + sigma M + Cᵀ W C
-    gram         the factor of C Cᵀ of one component
+    constraints  of the held nodes
+    factor       of K + Cᵀ W C
     """
 
     body: AssembledBody
-    nodes: Indices
-    shift: float
-    constraints: csr_array
+    constraints: Constraints
     factor: SymmetricFactor
-    gram: SymmetricFactor
+
+    @property
+    def nodes(self) -> Indices:
+        """(n_held,)"""
+        return self.constraints.nodes
 
     def project(self, parameters: Array) -> Array:
-        """P U: the parameters (c n_nodes, k) nearest to the given ones that hold the nodes; also P f of loads."""
-        held = self.constraints @ parameters
-        multipliers = self.gram.solve(held.reshape(len(self.nodes), -1)).reshape(held.shape)
-        return parameters - self.constraints.T @ multipliers
+        """As `Constraints.project`."""
+        return self.constraints.project(parameters)
 
     def approximate(self, load: Array) -> Array:
-        """P (K + sigma M + Cᵀ W C)⁻¹ P load: symmetric, the constraints exact, the rest up to the compliance of the penalty."""
+        """P (K + Cᵀ W C)⁻¹ P load: symmetric, the constraints exact, the rest up to the compliance of the penalty."""
         return self.project(self.factor.solve(self.project(load)))
-
-    def respond(self, load: Array) -> Array:
-        """The approximate response, corrected once: right to some nine digits."""
-        load = self.project(load)
-        response = self.approximate(load)
-        return response + self.approximate(load - self._reaction(response))
 
     def solve(self, load: Array) -> Array:
         """(c n_nodes, k): the parameters under loads (c n_nodes, k), N, which are conjugate to parameters.
@@ -71,12 +89,12 @@ class HeldBody:
         """
         load = self.project(load)
         solution = self.approximate(load)
-        residual = self.project(load - self._reaction(solution))
+        residual = self.project(load - self.body.stiffness @ solution)
         for _ in range(_MOST_CORRECTIONS):
             if np.linalg.norm(residual) <= _EXACT * np.linalg.norm(load):
                 break
             corrected = solution + self.approximate(residual)
-            left = self.project(load - self._reaction(corrected))
+            left = self.project(load - self.body.stiffness @ corrected)
             if not np.linalg.norm(left) < 0.5 * np.linalg.norm(residual):
                 break
             solution, residual = corrected, left
@@ -88,28 +106,17 @@ class HeldBody:
             )
         return solution
 
-    def _reaction(self, parameters: Array) -> Array:
-        """(K + sigma M) U."""
-        static = self.body.stiffness @ parameters
-        return static + self.shift * self.body.inertia(parameters) if self.shift else static
 
-
-def hold(body: AssembledBody, nodes: Indices, shift: float = 0.0, n_solves: int = 0) -> HeldBody:
-    """Factorize K + shift M with the nodes held; the shift, (rad/s)², is not negative. About n_solves loads will come.
+def hold(body: AssembledBody, nodes: Indices, n_solves: int = 0) -> HeldBody:
+    """Factorize K with the nodes held. About n_solves loads will come.
 
     Raises ValueError for a body that is not symmetric; LinAlgError where the nodes do not hold the body or the shape
     functions of two held nodes are the same; MemoryError where the factor does not fit.
     """
     if not body.symmetric:
         raise ValueError("the body is not symmetric: expected one of the conservative discretization")
-    rows = body.basis.value[nodes]
     return HeldBody(
-        body=body,
-        nodes=nodes,
-        shift=shift,
-        constraints=csr_array(kron(rows, eye_array(body.n_components), format="csr")),
-        factor=factorize(penalized(body, nodes, shift), n_solves=n_solves),
-        gram=factorize(csr_array(rows @ rows.T)),
+        body, Constraints.of(body, nodes), factorize(penalized(body, nodes, 0.0), n_solves=n_solves)
     )
 
 

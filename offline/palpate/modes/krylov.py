@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
-from palpate.modes.held_body import HeldBody
+from palpate.discretization.assembled_body import AssembledBody
+from palpate.modes.held_body import Constraints
 
 Array = NDArray[np.float64]
 
@@ -23,8 +24,10 @@ class KrylovSpace:
     coefficients  (size, k): what was appended last, in the vectors
     """
 
-    def __init__(self, n_parameters: int, most: int) -> None:
+    def __init__(self, body: AssembledBody, constraints: Constraints, most: int) -> None:
         """Room for `most` vectors. Raises MemoryError where they do not fit."""
+        self._body, self._constraints = body, constraints
+        n_parameters = body.stiffness.shape[0]
         self._vectors = np.empty((n_parameters, most), order="F")
         self._weighted = np.empty((n_parameters, most), order="F")
         self._last_block = slice(0, 0)
@@ -41,14 +44,20 @@ class KrylovSpace:
         """(c n_nodes, k), the vectors that were appended last."""
         return self._vectors[:, self._last_block]
 
-    def append(self, held: HeldBody, fields: Array) -> bool:
+    def resume(self, vectors: Array, last: int) -> None:
+        """Begin with the vectors (c n_nodes, k) that another space had, the last block of which had `last`."""
+        self.size = vectors.shape[1]
+        self._vectors[:, : self.size] = vectors
+        self._weighted[:, : self.size] = self._weigh(vectors)
+        self._last_block = slice(self.size - last, self.size)
+
+    def append(self, fields: Array) -> bool:
         """Append a block that spans parameters (c n_nodes, k) beside the vectors before.
 
         False where they hold nothing new, or do not fit any more.
         """
-        root_mass = np.repeat(np.sqrt(held.body.mass), held.body.n_components)[:, None]
         before, weighted_before = self.vectors, self._weighted[:, : self.size]
-        weighted = root_mass * held.body.basis.values(fields)
+        weighted = self._weigh(fields)
         largest = np.linalg.norm(weighted, axis=0).max()
         count, new = 0, np.eye(fields.shape[1])
         coefficients = np.zeros((self.size, fields.shape[1]))
@@ -64,11 +73,18 @@ class KrylovSpace:
             new = triangle[:count, np.argsort(order)] @ new
             fields = (fields - before @ along)[:, order[:count]]
             # It has also left less of the constraints and of the link between V and Y: both are made exact again.
-            fields = held.project(solve_triangular(triangle[:count, :count], fields.T, trans="T").T)
-            weighted = root_mass * held.body.basis.values(fields)
+            fields = self._constraints.project(
+                solve_triangular(triangle[:count, :count], fields.T, trans="T").T
+            )
+            weighted = self._weigh(fields)
         self._last_block = slice(self.size, self.size + count)
         self._vectors[:, self._last_block] = fields
         self._weighted[:, self._last_block] = weighted
         self.size += count
         self.coefficients = np.vstack([coefficients, new])
         return True
+
+    def _weigh(self, fields: Array) -> Array:
+        """m^{1/2} H V of parameters V (c n_nodes, k)."""
+        body = self._body
+        return np.repeat(np.sqrt(body.mass), body.n_components)[:, None] * body.basis.values(fields)

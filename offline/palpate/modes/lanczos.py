@@ -50,13 +50,13 @@ def lowest_modes(held: HeldBody, n_modes: int, seed: int = 0) -> LowestModes:
             f"n_modes = {n_modes}: expected from 1 to {most}, the number of free displacement components"
         )
     wanted = min(n_modes + _GUARD, most)
-    space = KrylovSpace(n, min(most, 6 * wanted + 20 * BLOCK))
+    space = KrylovSpace(held.body, held.constraints, min(most, 6 * wanted + 20 * BLOCK))
     random = np.random.default_rng(seed)
     inverse, judged = np.zeros((0, 0)), 0
-    space.append(held, held.project(random.standard_normal((n, min(BLOCK, most)))))
+    space.append(held.project(random.standard_normal((n, min(BLOCK, most)))))
     while True:
         known = space.size
-        growing = space.append(held, held.approximate(held.body.inertia(space.last_block)))
+        growing = space.append(held.approximate(held.body.inertia(space.last_block)))
         inverse = _bordered(inverse, space.coefficients, known)
         if growing and known < max(2 * wanted, 1.2 * judged):
             continue

@@ -7,7 +7,6 @@ the space, so it is exact at 0 Hz. Diagonalized, it has the form of any other `E
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,16 +15,35 @@ from scipy.linalg import eigh
 
 from palpate.discretization.assembled_body import AssembledBody
 from palpate.modes.elastic_modes import ElasticModes
-from palpate.modes.held_body import HeldBody, hold
+from palpate.modes.held_body import hold
 from palpate.modes.krylov import KrylovSpace
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 STEPS_JUDGED = 20
-"""Steps (60 vectors of one patch) over whose last the change of the force is measured."""
+"""Steps (60 vectors of one patch) after which the force is compared with what it was before them."""
 
 MOST_STEPS = 200
 """Steps at 0 Hz after which a body counts as not converged."""
+
+
+@dataclass(frozen=True)
+class StaticSpace:
+    """The Krylov vectors at 0 Hz, which depend on the shape of the body, its supports and Poisson's ratio alone.
+
+    vectors    (c n_nodes, n), V
+    stiffness  (n, n), Vᵀ K V
+    ends       numbers of vectors at which the force is compared, ascending
+    last       number of vectors of the last step
+    exhausted  whether a further step would hold nothing new
+    """
+
+    vectors: Array
+    stiffness: Array
+    ends: tuple[int, ...]
+    last: int
+    exhausted: bool
 
 
 @dataclass(frozen=True)
@@ -35,26 +53,25 @@ class RitzModes:
     modes   of the body
     change  largest change of the force over the last 20 steps at 0 Hz, relative to the force at the same frequency, in
             2-norms: about the error of a model with that many steps fewer, and so above the error of this one
-    solver  the direct solver that was used
+    space   all vectors at 0 Hz that are known, to be given to the next call for the same body
     """
 
     modes: ElasticModes
     change: float
-    solver: str
+    space: StaticSpace
 
 
 def ritz_modes(
     body: AssembledBody,
-    squared_s: NDArray[np.complex128],
+    squared_s: Complex,
     tolerance: float,
-    shifts: Sequence[tuple[float, int]] = (),
+    known: StaticSpace | None = None,
 ) -> RitzModes:
-    """Add static responses until the force changes by at most `tolerance`, or for 200 steps; then those at the shifts.
+    """Static responses until the force changes by at most `tolerance`, or for 200 steps.
 
     squared_s  (n_frequencies,), (rad/s)²: s² / h(s) at the frequencies where the force is compared, h being the material's
                transfer factor
-    shifts     (sigma, number of steps) each: responses of K + sigma M, sigma in (rad/s)² above 0, which serve frequencies
-               about sqrt(sigma) and take one factorization each
+    known      vectors of a call before; the body is not factorized where they are enough
 
     Raises as `hold`; ValueError where no node is in a patch.
     """
@@ -62,32 +79,56 @@ def ritz_modes(
     if not supports.contacts:
         raise ValueError("the body has no contact patch: expected one, to which the Ritz vectors respond")
     patch: Array = np.kron(body.basis.parameters(supports.tips.toarray()), np.eye(c)).astype(np.float64)
-    n_inputs = c * len(supports.contacts)
+    n_inputs = patch.shape[1]
     patch_force = body.stiffness @ patch
     direct = patch.T @ patch_force
-    n_steps = MOST_STEPS + sum(steps for _, steps in shifts)
-    nothing = np.zeros((0, n_inputs)), np.zeros((0, 0))
-    projected = _Projected(body, patch_force, (direct + direct.T) / 2, *nothing)
-    space = KrylovSpace(len(patch), most=n_steps * n_inputs)
+    empty = _Projected(body, patch_force, (direct + direct.T) / 2, np.zeros((0, n_inputs)), np.zeros((0, 0)))
+    static = known or StaticSpace(np.zeros((len(patch), 0)), np.zeros((0, 0)), (), 0, False)
+    end, change = _enough(empty, static, squared_s, tolerance)
+    if end is None:
+        static, end, change = _extended(empty, static, squared_s, tolerance)
 
-    held = hold(body, supports.prescribed)
-    solver = held.factor.solver
-    growing = space.append(held, held.solve(patch_force))
-    projected = projected.extended(space.vectors)
-    change, force = np.inf, projected.force(squared_s)
-    while growing and change > tolerance and space.size < MOST_STEPS * n_inputs:
-        for _ in range(STEPS_JUDGED):
-            growing = growing and _extend(space, held)
-        projected = projected.extended(space.vectors)
-        before, force = force, projected.force(squared_s)
-        change = _largest_relative(force - before, force)
-    for sigma, steps in shifts:
-        del held  # one factor at a time is all that a large body's memory holds
-        held = hold(body, supports.prescribed, sigma)
-        growing = True  # the last block holds more that is new than the response to the patch does
-        for _ in range(steps):
-            growing = growing and _extend(space, held)
-    return RitzModes(projected.extended(space.vectors).modes(space.vectors, patch), change, solver)
+    projected = empty.on(static, end)
+    return RitzModes(projected.modes(static.vectors[:, :end], patch), change, static)
+
+
+def _enough(
+    empty: _Projected, static: StaticSpace, squared_s: Complex, tolerance: float
+) -> tuple[int | None, float]:
+    """The number of vectors after which the force changes no more, None where they are too few, and the last change."""
+    force, change = None, np.inf
+    for end in static.ends:
+        before, force = force, empty.on(static, end).force(squared_s)
+        if before is not None:
+            change = _largest_relative(force - before, force)
+        if change <= tolerance:
+            return end, change
+    return (static.ends[-1] if static.exhausted else None), change
+
+
+def _extended(
+    empty: _Projected, static: StaticSpace, squared_s: Complex, tolerance: float
+) -> tuple[StaticSpace, int, float]:
+    """More static responses until they are enough: the space, the number of vectors to use, and the last change."""
+    body = empty.body
+    held = hold(body, body.supports.prescribed)
+    most = MOST_STEPS * empty.patch_force.shape[1]
+    space = KrylovSpace(body, held.constraints, most)
+    space.resume(static.vectors, static.last)
+    end = None
+    while end is None:
+        growing = True
+        if not space.size:
+            growing = space.append(held.solve(empty.patch_force))
+        else:
+            for _ in range(STEPS_JUDGED):
+                growing = growing and space.append(held.approximate(body.inertia(space.last_block)))
+        projected = empty.on(static, static.vectors.shape[1]).extended(space.vectors)
+        exhausted = not growing or space.size >= most
+        last = space.last_block.shape[1]
+        static = StaticSpace(space.vectors, projected.stiffness, (*static.ends, space.size), last, exhausted)
+        end, change = _enough(empty, static, squared_s, tolerance)
+    return static, end, change
 
 
 @dataclass(frozen=True)
@@ -99,6 +140,14 @@ class _Projected:
     direct: Array
     coupling: Array
     stiffness: Array
+
+    def on(self, static: StaticSpace, end: int) -> _Projected:
+        """On the first `end` vectors of a space."""
+        return replace(
+            self,
+            coupling=static.vectors[:, :end].T @ self.patch_force,
+            stiffness=static.stiffness[:end, :end],
+        )
 
     def extended(self, vectors: Array) -> _Projected:
         """With further vectors; what is known of the first ones is kept."""
@@ -126,15 +175,6 @@ class _Projected:
             parameters=vectors @ rotation,
             patch_parameters=patch,
         )
-
-
-def _extend(space: KrylovSpace, held: HeldBody) -> bool:
-    """Append (K + sigma M)⁻¹ M times the last block.
-
-    Without the correction in `respond` the responses at 0 Hz and at a shift would belong to bodies with supports of
-    different compliance, and their difference, not the shift, would be what is new in the second ones.
-    """
-    return space.append(held, held.respond(held.body.inertia(space.last_block)))
 
 
 def _largest_relative(difference: NDArray[np.complex128], force: NDArray[np.complex128]) -> float:

@@ -12,6 +12,7 @@ from palpate.lti.frequencies import (
     band_frequencies,
     maximum,
     relative_errors,
+    smoothed_response,
     spectral_norms,
 )
 from palpate.lti.pole_residue import PoleResidueSystem
@@ -90,7 +91,7 @@ def in_band_error(full: PoleResidueSystem, reduced: PoleResidueSystem, omega: Ar
 def gain_above_band(
     full: PoleResidueSystem, running: PoleResidueSystem, period_s: float, band_end_hz: float
 ) -> float:
-    """Largest |F_running| / |F| from the band's end to half the sampling rate.
+    """Largest |F_running| / |F| from the band's end to half the sampling rate, F by `smoothed_response`.
 
     The trapezoidal rule alone makes it more than 1 where the force rises with frequency: it shifts frequencies down.
     """
@@ -101,7 +102,7 @@ def gain_above_band(
 
     def gain(w: Array) -> Array:
         return spectral_norms(running.transfer(np.exp(1j * w * period_s))) / spectral_norms(
-            full.transfer(1j * w)
+            smoothed_response(full, w, start)
         )
 
     return maximum(gain, omega)[1]

@@ -11,8 +11,8 @@ a sum of terms each of which is a spring and a mass in series: F(s)/s is positiv
 2. Above them a body has thousands of overlapping modes and the subspace has a few, whose resonances stand out. They are
    replaced by damped terms R_k s² w_k² / (s² + 2 zeta_k w_k s + w_k²) with prescribed poles and R_k symmetric positive
    semidefinite: a spring, a mass and a dashpot in series, again positive real. In the band it is the mass that counts.
-   The R_k are fitted to the full model by nonnegative least squares, from 0 Hz to half the sampling rate, with a
-   prescribed denominator the fit is convex (Coelho, Phillips & Silveira 2004). Directions are added where they lower
+   The R_k are fitted to the full model, smoothed above the band (`smoothed_response`), by nonnegative least squares
+   from 0 Hz to half the sampling rate: with a prescribed denominator the fit is convex (Coelho, Phillips & Silveira 2004). Directions are added where they lower
    the residual most (column generation).
 
 So the model is passive whatever the fit gives, and its statics are exact. The fit is made to the model as it runs, each
@@ -31,7 +31,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
 from palpate.lti.errors import ReductionError
-from palpate.lti.frequencies import band_frequencies, relative_errors, spectral_norms
+from palpate.lti.frequencies import band_frequencies, relative_errors, smoothed_response, spectral_norms
 from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.lti.sampling import Sampling
 from palpate.lti.viscoelastic import viscoelastic_system
@@ -247,11 +247,12 @@ def with_fitted_terms(
         return kept
     omega = _fit_frequencies(full, sampling)
     terms = np.stack([sampling.response(_term(pole, np.eye(1)), omega)[:, 0, 0] for pole in poles], axis=1)
+    band_end = 2 * np.pi * sampling.band_hz[1]
     target = _Target(
-        full.transfer(1j * omega),
+        smoothed_response(full, omega, band_end),
         sampling.response(kept, omega),
         terms,
-        omega <= 2 * np.pi * sampling.band_hz[1],
+        omega <= band_end,
     )
     systems = [kept, *(_term(p, r) for p, r in zip(poles, _fitted(target), strict=True) if np.any(r))]
     return PoleResidueSystem(

@@ -75,6 +75,11 @@ class Material:
     prony: PronySeries = PronySeries()
 
     @property
+    def unit(self) -> Material:
+        """The elastic material of the same Poisson's ratio with E = 1 Pa and rho = 1 kg/m³."""
+        return Material(1.0, self.poissons_ratio, 1.0)
+
+    @property
     def shear_modulus_pa(self) -> float:
         """G = E / (2 (1 + nu)), Pa."""
         return self.youngs_modulus_pa / (2 * (1 + self.poissons_ratio))

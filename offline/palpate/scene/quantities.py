@@ -16,9 +16,6 @@ class Table(BaseModel):
 SHORTEST_M, LONGEST_M = 1e-6, 1e4
 """Lengths of bodies and of their parts."""
 
-MAX_NODES = 200_000
-"""More nodes than this are a slip in a unit."""
-
 SystemMethod = Literal["tbr", "tbr-band", "hankel-optimal", "modal", "modal-static"]
 """Reductions of any stable linear system."""
 ReductionMethod = Literal["passive", SystemMethod]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import re
 import tomllib
 from pathlib import Path
@@ -14,7 +13,6 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator, mo
 from palpate.model_file import LONGEST_PERIOD_S, SHORTEST_PERIOD_S
 from palpate.scene.material import PRESETS, Material, PronySeries, check_constant
 from palpate.scene.quantities import (
-    MAX_NODES,
     SHORTEST_M,
     Count,
     Length,
@@ -52,8 +50,6 @@ class BoxGeometry(Table):
             )
         if min(self.counts) < 3:
             raise ValueError(f"counts = {list(self.counts)}: expected at least 3 along each axis")
-        if math.prod(self.counts) > MAX_NODES:
-            raise ValueError(f"counts = {list(self.counts)}: expected at most {MAX_NODES:,} nodes in all")
         return self
 
 
@@ -66,11 +62,9 @@ class BallGeometry(Table):
 
     @model_validator(mode="after")
     def _is_of_a_size(self) -> BallGeometry:
-        nodes = 4 / 3 * math.pi * (self.radius_m / self.spacing_m) ** 3
-        if self.spacing_m > self.radius_m / 2 or nodes > MAX_NODES:
+        if self.spacing_m > self.radius_m / 2:
             raise ValueError(
-                f"spacing_m = {self.spacing_m:g} in a ball of radius_m = {self.radius_m:g} makes about {nodes:.3g} nodes: "
-                f"expected at most half the radius, and at most {MAX_NODES:,} nodes"
+                f"spacing_m = {self.spacing_m:g} in a ball of radius_m = {self.radius_m:g}: expected at most half the radius"
             )
         return self
 

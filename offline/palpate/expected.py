@@ -1,0 +1,134 @@
+"""What a build will take, before anything dear is computed: nodes, and time and memory of each stage."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from scipy.integrate import quad
+
+from palpate.factorization import solver_name
+from palpate.geometry.measures import enclosed_volume, triangle_normals
+from palpate.geometry.spacing import Refinement
+from palpate.geometry.surface import load_surface
+from palpate.memory import machine_memory
+from palpate.modes.body_modes import STEPS_EXPECTED, by_ritz, factor_memory, stiffness_memory
+from palpate.modes.dense import dense_memory
+from palpate.scene.schema import BallGeometry, BoxGeometry, Config, SurfaceGeometry
+from palpate.scene_cloud import refinements
+
+
+@dataclass(frozen=True)
+class BodySize:
+    """What time and memory depend on. Nodes of a surface's inside are estimated, to some 5 %."""
+
+    n_nodes: int
+    n_contacts: int
+    symmetric: bool
+    support_radius: float
+    on_surface: bool
+
+
+@dataclass(frozen=True)
+class ExpectedStage:
+    """seconds of wall clock on two quiet cores of 2.5 GHz; peak_bytes of the process."""
+
+    name: str
+    seconds: float
+    peak_bytes: float
+
+
+def expected_size(config: Config, folder: Path) -> BodySize:
+    """The size of a scene's body; files are relative to `folder`. Raises FileNotFoundError, SurfaceError."""
+    geometry = config.geometry
+    match geometry:
+        case BoxGeometry(counts=counts):
+            nodes = float(math.prod(counts))
+        case BallGeometry(radius_m=radius, spacing_m=spacing):
+            nodes = 4 / 3 * math.pi * (radius / spacing + 0.5) ** 3
+        case SurfaceGeometry():
+            nodes = _nodes_inside(config, geometry, folder)
+    discretization = config.discretization
+    return BodySize(
+        n_nodes=round(nodes),
+        n_contacts=len(config.contact),
+        symmetric=discretization.method == "conservative",
+        support_radius=discretization.support_radius,
+        on_surface=isinstance(geometry, SurfaceGeometry),
+    )
+
+
+def _nodes_inside(config: Config, geometry: SurfaceGeometry, folder: Path) -> float:
+    """The integral of one node per spacing³ over the body, and of half a node per spacing² over its surface.
+
+    The spacing grows away from a refined contact, about which the body is taken for a half-space.
+    """
+    surface = load_surface(folder / geometry.file, geometry.file_unit).surface
+    h = geometry.spacing_m
+    nodes = enclosed_volume(surface) / h**3 + float(triangle_normals(surface)[1].sum()) / h**2 / 2
+    for patch in refinements(config):
+        reach = patch.radius_m + (h - patch.spacing_m) / patch.growth
+
+        def more(r: float, patch: Refinement = patch) -> float:
+            fine = patch.spacing_m + patch.growth * max(0.0, r - patch.radius_m)
+            return 2 * math.pi * r**2 * (fine**-3 - h**-3) + math.pi * r * (fine**-2 - h**-2)
+
+        if reach > 0:
+            nodes += quad(more, 0, reach, points=[patch.radius_m])[0]
+    return nodes
+
+
+def require_memory(size: BodySize) -> None:
+    """Raise MemoryError where the machine has less memory than the build needs."""
+    needed, present = max(stage.peak_bytes for stage in expected_stages(size)), machine_memory()
+    if needed > present:
+        kind = "Ritz" if by_ritz(size.n_nodes, size.symmetric) else "all"
+        raise MemoryError(
+            f"{kind} modes of about {size.n_nodes:,} nodes need about {needed / 2**30:.1f} GiB, this machine has "
+            f"{present / 2**30:.1f}: use a coarser cloud, graded towards the contact patches"
+        )
+
+
+def expected_stages(size: BodySize) -> list[ExpectedStage]:
+    """In order, by the laws that `benchmarks/organ_scale.py` measured (docs/validation.md)."""
+    n, wider = size.n_nodes, size.support_radius / 2.2
+    stiffness = stiffness_memory(n, size.support_radius)
+    cloud = ExpectedStage("node cloud", 1e-3 * n if size.on_surface else 0.0, _PROGRAM + 9e4 * n)
+    assembly = ExpectedStage("assembly", 1e-3 * n * wider**4, _PROGRAM + 3 * stiffness)
+    if by_ritz(n, size.symmetric):
+        modes = _ritz(size, stiffness)
+    else:
+        modes = ExpectedStage("modes, all", 1e-8 * n**3, _PROGRAM + dense_memory(n, n, 3, size.symmetric))
+    return [cloud, assembly, modes]
+
+
+def _ritz(size: BodySize, stiffness: float) -> ExpectedStage:
+    n, solver = size.n_nodes, solver_name()
+    factor = factor_memory(n, size.support_radius)
+    vectors = 2 * 8 * 9 * n * STEPS_EXPECTED * size.n_contacts
+    seconds = 1e-3 * n
+    return ExpectedStage(f"modes, Ritz, {solver}", seconds, _PROGRAM + 3 * stiffness + factor + vectors)
+
+
+_PROGRAM = 0.5 * 2**30
+"""Bytes of the interpreter and the libraries."""
+
+
+def expectation_text(config: Config, folder: Path) -> str:
+    """What `palpate build --dry-run` prints. Raises as `expected_size`; ValueError for a scene with tools."""
+    if config.tool:
+        raise ValueError("--dry-run knows scenes with contacts: expected none with [[tool]]")
+    size = expected_size(config, folder)
+    lines = [f"{config.name}: about {size.n_nodes:,} nodes, {3 * size.n_nodes:,} unknowns", ""]
+    lines += [f"{'stage':28} {'seconds':>8} {'peak GiB':>9}"]
+    stages = expected_stages(size)
+    lines += [f"{s.name:28} {s.seconds:8.0f} {s.peak_bytes / 2**30:9.1f}" for s in stages]
+    most = max(s.peak_bytes for s in stages)
+    lines += [
+        f"{'all':28} {sum(s.seconds for s in stages):8.0f} {most / 2**30:9.1f}",
+        "",
+        f"Seconds are those of two quiet cores. This machine has {machine_memory() / 2**30:.1f} GiB"
+        + ("." if most <= machine_memory() else ": too little, use a coarser cloud."),
+    ]
+    return "\n".join(lines)
