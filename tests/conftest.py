@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -23,6 +23,14 @@ region = "plane"
 point_m = [0.0, 0.0, 0.0001]
 normal = [0.0, 0.0, -1.0]
 """
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_stages_of_earlier_builds(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """`palpate build` keeps its stages in a folder of this session."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(scope="session")
