@@ -1,0 +1,137 @@
+"""What a tick of contact costs: body, tracking and solver, against points, modes and tools; beside MuJoCo's flex.
+
+    python benchmarks/contact_tick.py [--ticks 3000] [--model liver.npz] [--flex]
+
+Tools of radius 5 mm slide at once over a surface with a point every 3 mm, pressed in by 3 mm; microseconds of wall time a tick,
+compute alone. `rows` are the points in the system a tick, `sweeps` of the solver. `--model` takes a surface model instead, and
+slides its tools around the points nearest to their homes. `--flex` steps a MuJoCo flex with about as many nodes, on which a
+sphere presses, by 1 ms with the same number of points, in the same run (package mujoco).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported
+
+import numpy as np
+from numba import njit
+
+from palpate.model_file import SurfaceModel, ToolShape, load_model
+from palpate_server import simulation  # registers the image
+from palpate_server.coupling import sphere_contact
+from palpate_server.diagnostics.sample_surface import half_space_model
+from palpate_server.realtime.clock import monotonic_ns
+from palpate_server.realtime.native_image import make_image, view
+from palpate_server.realtime.records import REACTION
+
+RADIUS_M, DEPTH_M, REACH_M = 5e-3, 3e-3, 0.012
+
+
+@njit
+def run(image, positions, wanted, force, reactions, nanoseconds, sizes):
+    contact = view(image)
+    for k in range(positions.shape[0]):
+        start = monotonic_ns()
+        sphere_contact.advance(contact, positions[k], wanted, force, reactions)
+        nanoseconds[k] = monotonic_ns() - start
+        sizes[k, 0] = contact.rows.n_rows[0]
+        sizes[k, 1] = contact.rows.sweeps[1]
+        for tool in range(wanted.size):
+            sizes[k, 2] += reactions[tool].n_contact_points
+
+
+def synthetic(count: int, modes: int, tools: int) -> SurfaceModel:
+    places = (np.arange(tools) - (tools - 1) / 2) * 0.03
+    shapes = [ToolShape(f"tip{i}", RADIUS_M, 0.3, (x, 0.0, 0.01)) for i, x in enumerate(places)]
+    return half_space_model(shapes, count, 3e-3, 3e3, prony=([0.5, 0.3], [0.58, 0.004]), n_modes=modes)
+
+
+def slides(model: SurfaceModel, ticks: int) -> np.ndarray:
+    """(ticks, n_tools, 3), m: pressed in within 0.2 s, then along Lissajous figures at some 0.1 m/s."""
+    time_s = np.arange(ticks) * model.period_s
+    positions = np.empty((ticks, len(model.tools), 3))
+    for i, tool in enumerate(model.tools):
+        point = np.argmin(np.linalg.norm(model.points - tool.home_m, axis=1))
+        normal = model.normals[point]
+        first = np.cross(normal, [1.0, 0.0, 0.0] if abs(normal[0]) < 0.9 else [0.0, 1.0, 0.0])
+        first /= np.linalg.norm(first)
+        height = tool.radius_m + 1e-3 - np.minimum(time_s * 0.02, DEPTH_M + 1e-3)
+        along = REACH_M * np.sin(2 * np.pi * 1.5 * time_s)
+        across = REACH_M * np.sin(2 * np.pi * 1.1 * time_s + i)
+        second = np.cross(normal, first)
+        positions[:, i] = model.points[point] + np.stack([height, along, across], 1) @ np.stack(
+            [normal, first, second]
+        )
+    return positions
+
+
+def row(name: str, model: SurfaceModel, ticks: int) -> None:
+    contact = sphere_contact.make(model)
+    image, n = make_image(contact), len(model.tools)
+    positions = slides(model, ticks)
+    nanoseconds, sizes = np.zeros(ticks, np.int64), np.zeros((ticks, 3), np.int64)
+    run(image, positions, np.full(n, 1), np.zeros((n, 3)), np.zeros(n, REACTION), nanoseconds, sizes)
+    times = nanoseconds[300:] / 1e3
+    median, p99, p999 = np.percentile(times, [50, 99, 99.9])
+    rows, sweeps, points = sizes[300:].mean(axis=0)
+    print(
+        f"{name:12s} {model.n_points:6d} {model.n_modes:6d} {n:6d} | {median:8.1f} {p99:8.1f} {p999:8.1f} | "
+        f"{rows:6.1f} {sweeps:6.1f} {points:6.1f}",
+        flush=True,
+    )
+
+
+def flex(nodes_a_side: int, steps: int) -> None:
+    import mujoco
+
+    spacing = 0.06 / (nodes_a_side - 1)
+    xml = f"""<mujoco><option timestep="0.001" integrator="discrete"/><worldbody>
+      <flexcomp name="block" type="grid" count="{nodes_a_side} {nodes_a_side} {nodes_a_side}" spacing="{spacing} {spacing} {spacing}"
+        dim="3" mass="0.2" radius="0.0005" pos="0 0 0.03"><elasticity young="3e3" poisson="0.45" damping="0.01"/>
+        <pin gridrange="0 0 0 {nodes_a_side - 1} {nodes_a_side - 1} 0"/></flexcomp>
+      <body name="tip" mocap="true" pos="0 0 0.066"><geom type="sphere" size="{RADIUS_M}"/></body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data, times = mujoco.MjData(model), []
+    for k in range(steps):
+        data.mocap_pos[0] = (0.0, 0.0, 0.066 - min(k * 1e-4, 0.004))
+        start = time.perf_counter()
+        mujoco.mj_step(model, data)
+        times.append((time.perf_counter() - start) * 1e6)
+    median, p99 = np.percentile(times[steps // 4 :], [50, 99])
+    print(
+        f"MuJoCo {mujoco.__version__} flex, {nodes_a_side**3} nodes, one sphere: median {median:.0f}, p99 {p99:.0f} us a step"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--ticks", type=int, default=3000)
+    parser.add_argument("--model", help="a surface model's file")
+    parser.add_argument("--flex", action="store_true", help="beside MuJoCo's flex")
+    options = parser.parse_args()
+    assert simulation is not None
+    print("model        points  modes  tools |   median      p99    p99.9 |   rows sweeps points")
+    if options.model:
+        model = load_model(Path(options.model))
+        assert isinstance(model, SurfaceModel), "expected a surface model"
+        tools = (model.tools * 3)[:3]
+        away = (-0.03, 0.0, 0.03)
+        tools = tuple(
+            replace(t, home_m=(t.home_m[0] + x, *t.home_m[1:])) for t, x in zip(tools, away, strict=True)
+        )
+        row("file", replace(model, tools=tools), options.ticks)
+    else:
+        for count, modes, tools in ((31, 300, 1), (31, 300, 3), (31, 1000, 3), (21, 300, 3), (44, 1000, 3)):
+            row("half-space", synthetic(count, modes, tools), options.ticks)
+    if options.flex:
+        flex(10, 200)
+        flex(12, 100)
+
+
+if __name__ == "__main__":
+    main()
