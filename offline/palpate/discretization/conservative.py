@@ -6,8 +6,8 @@ cell, by the second derivatives of the shape functions; half of the deviatoric e
 any, bending is too soft; all of it makes bending exact even with two nodes through the thickness, and a coarse patch too
 stiff, under whose edge the shape functions exaggerate second derivatives. (Strain at a node on the surface, given the
 node's whole cell, bends 3 times too stiffly there. Hillman & Chen 2016 add the variation about the node.) The
-volumetric part is left out, so that nothing locks when the body is nearly incompressible. With M = H^T rho V H the mass of
-a nodal value is rho V. The gradient is corrected to obey the divergence theorem (see `consistency`), so that constant
+volumetric part is left out, so that nothing locks when the body is nearly incompressible. M = H^T m H with the masses m of
+`inertia`. The gradient is corrected to obey the divergence theorem (see `consistency`), so that constant
 stress is in equilibrium. Traction-free surfaces are natural. The force on a contact patch is conjugate to the displacement
 of its tip.
 """
@@ -22,6 +22,7 @@ from scipy.sparse import csr_array
 
 from palpate.discretization.assembled_body import AssembledBody
 from palpate.discretization.consistency import consistent_gradient, vector_areas
+from palpate.discretization.inertia import inertial_volumes
 from palpate.discretization.nodal import SUPPORT_RADIUS_FACTOR, NodalBasis, nodal_basis
 from palpate.discretization.stiffness import isotropic_stiffness
 from palpate.discretization.supports import require_volumes, supports
@@ -57,7 +58,7 @@ def assemble(
         stiffness=isotropic_stiffness(
             pattern, gradient, cloud.volumes, np.array([volumetric, *3 * [-2 / 3 * mu]]), mu
         ),
-        mass=material.density_kg_per_m3 * cloud.volumes,
+        mass=material.density_kg_per_m3 * inertial_volumes(cloud, basis),
         supports=held,
         symmetric=True,
     )

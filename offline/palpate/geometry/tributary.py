@@ -23,14 +23,14 @@ _NEIGHBORS = 24
 
 
 def nearest_node(nodes: Array, samples: Array, sight: Sight | None = None) -> NDArray[np.intp]:
-    """Index of the node nearest to each sample, (n_samples,); nodes (n_nodes, 3) and samples (n_samples, 3) in m.
+    """Index of the node nearest to each sample, (n_samples,); nodes (n_nodes, dim) and samples (n_samples, dim) in m.
 
     With the samples' sight, next to gaps it is the nearest of the nodes that the sample sees inside the body. A node that
     is nearest to none gets the sample nearest to it, so that it has a share wherever it lies; should two such nodes want
     the same sample, one of them stays without.
     """
     tree = cKDTree(nodes)
-    owner = _nearest(nodes, tree, samples)
+    owner = _nearest(nodes, tree, samples) if nodes.shape[1] == 3 else np.asarray(tree.query(samples)[1])
     if sight is not None and len(sight.beside):
         owner[sight.beside] = _nearest_in_sight(nodes, tree, owner[sight.beside], samples, sight)
     empty = np.flatnonzero(np.bincount(owner, minlength=len(nodes)) == 0)

@@ -166,9 +166,11 @@ def test_stiffness_is_symmetric_and_semi_definite_with_six_rigid_motions(cloud):
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.2])
-def test_cube_frequencies_are_within_four_percent_at_nine_nodes_an_edge_and_improve_with_refinement(jitter):
+def test_cube_frequencies_are_within_two_and_a_half_percent_at_nine_nodes_an_edge_and_improve_with_refinement(
+    jitter,
+):
     coarse, medium, fine = (_cube_error(n, jitter) for n in (5, 7, 9))
-    assert fine.max() < 0.04
+    assert fine.max() < 0.025  # measured 2.1 and 1.3 %, with 7 nodes 2.6 %
     assert fine.max() < medium.max() < coarse.max()
     assert np.linalg.norm(fine) < np.linalg.norm(medium) < np.linalg.norm(coarse)
 
@@ -176,13 +178,13 @@ def test_cube_frequencies_are_within_four_percent_at_nine_nodes_an_edge_and_impr
 def test_a_free_ball_has_six_rigid_modes_and_lambs_frequencies():
     frequencies = _ball_frequencies(0.22)
     assert frequencies[5] < 1e-4 < frequencies[6]
-    np.testing.assert_allclose(frequencies[6:], LAMB, rtol=0.05)
+    np.testing.assert_allclose(frequencies[6:], LAMB, rtol=0.02)  # measured 1.2 %
 
 
 @pytest.mark.slow
 def test_a_free_balls_frequencies_improve_with_refinement():
     coarse, fine = (np.abs(_ball_frequencies(spacing)[6:] / LAMB - 1).max() for spacing in (0.22, 0.16))
-    assert fine < 0.04
+    assert fine < 0.01
     assert fine < coarse
 
 
@@ -191,7 +193,7 @@ def test_modes_are_mass_normalized_and_diagonalize_the_stiffness():
     body = conservative.assemble(cloud, CUBE, bottom, [])
     modes = elastic_modes(body)
     k = _free_stiffness(cloud)
-    mass = np.repeat(CUBE.density_kg_per_m3 * cloud.volumes, 3)
+    mass = np.repeat(body.mass, 3)
     phi = body.basis.values(modes.parameters)
     np.testing.assert_allclose(phi.T @ (mass[:, None] * phi), np.eye(modes.n_modes), atol=1e-11)
     scale = 1e-11 * modes.squared_frequencies[-1]
