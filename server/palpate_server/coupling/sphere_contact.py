@@ -44,7 +44,6 @@ _SPARE_SLOTS = 16  # for points in contact that are no longer near the anchor
 _MARGIN = 0.05  # of the radius: points with a smaller gap are rows of the system
 _NEAR_GAP = 0.4  # of the radius: points with a larger gap are looked at only
 _EVERY = 8  # ticks
-_LEAST_HEIGHT = 2.0  # of the radius, see _face
 _GRIP = 1e12  # N
 _RELEASE_S = 0.02  # time constant of a bond after release
 _LEAST_BOND_N = 1e-3
@@ -395,8 +394,8 @@ def _is_beneath(contact: SphereContact, tool: int) -> bool:
 def _face(contact: SphereContact, tool: int, slot: int, beneath: bool) -> bool:
     """Write gap and normal of a watched point against a tool. Returns whether it is to be a row.
 
-    The normal points from the center to the point. Where the center is not above the point's tangent plane by a quarter of the
-    radius, the normal is tilted as if it were, so that it always resists the center's going deeper, and changes steadily.
+    The tip is the paraboloid that osculates the sphere along the point's normal at rest, as in Hertz's theory. Unlike a sphere's,
+    its sides never stand upright: points that are pressed deep can't pass around it.
     """
     slots, body, follow = contact.slots, contact.body, contact.tracking
     point, radius = body.watched[slot], contact.tools.radius[tool]
@@ -406,8 +405,7 @@ def _face(contact: SphereContact, tool: int, slot: int, beneath: bool) -> bool:
         distance += apart * apart
         height -= apart * follow.normals[point, c]
     lateral = math.sqrt(max(0.0, distance - height * height))
-    distance = math.sqrt(distance)
-    lift = max(0.0, _LEAST_HEIGHT * radius - height)
+    lift = radius - height
     length, alignment = 0.0, 0.0
     anchor = follow.anchor[tool]
     for c in range(3):
@@ -420,7 +418,7 @@ def _face(contact: SphereContact, tool: int, slot: int, beneath: bool) -> bool:
     for c in range(3):
         slots.normal[slot, c] /= length
         approach += slots.normal[slot, c] * (body.step[slot, c] - contact.tools.moved[tool, c])
-    gap = distance - radius
+    gap = (height - radius + 0.5 * lateral * lateral / radius) * radius / length
     if height <= 0.0:
         slots.gap[slot] = min(gap, 0.0) if beneath else gap
         return beneath and alignment > 0.0 and lateral < radius
