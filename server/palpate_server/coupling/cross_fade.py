@@ -5,7 +5,7 @@ All arrays of the functions below are in the model's frame.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from palpate_server.realtime.records import REACTION
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Records = NDArray[np.void]
+Record = Any  # one element of a structured array
 
 
 class Coupling(NamedTuple):
@@ -98,9 +99,20 @@ def advance(
 
 
 @compiled
-def is_still(coupling: Coupling, displacement: Floats, force: Floats) -> bool:
+def is_still(
+    coupling: Coupling, displacement: Floats, force: Floats, reactions: Records, ledger: Floats
+) -> bool:
     """Whether no model is being faded in, and nothing moves that anybody would notice."""
-    return coupling.fade[1] == 0.0 and models.is_still(coupling.running, displacement, force)
+    return coupling.fade[1] == 0.0 and models.is_still(
+        coupling.running, displacement, force, reactions, ledger
+    )
+
+
+@compiled
+def set_tip(coupling: Coupling, tool: int, settings: Record) -> None:
+    """Give a tool that touches nothing the tip in its settings (SETTINGS)."""
+    models.set_tip(coupling.running, tool, settings)
+    models.set_tip(coupling.following, tool, settings)
 
 
 @compiled

@@ -2,46 +2,83 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_server.coupling import fixed_patch
+from palpate_client.wire import Flags
+from palpate_server.coupling import fixed_patch, sphere_contact
 from palpate_server.coupling.fixed_patch import FixedPatch
+from palpate_server.coupling.sphere_contact import SphereContact
 from palpate_server.realtime.compiled import compiled
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Records = NDArray[np.void]
+Record = Any  # one element of a structured array
 
 LIFTED, TOUCHING, GRABBING = range(3)  # what is wanted of a tool in a tick
 
 _REST_FORCE_N = 1e-9
+_REST_ENERGY_J = 1e-15
+_IN_CONTACT = int(Flags.IN_CONTACT)
+
+
+class Tip(NamedTuple):
+    """The sphere that a tool touches a surface model with.
+
+    stiffness_n_per_m: of the spring between device and sphere, in the model
+    start_m: where its center is when it touches the undeformed tissue without pressing, m, in the model's frame
+    """
+
+    radius_m: float
+    friction: float
+    stiffness_n_per_m: float
+    start_m: tuple[float, float, float]
 
 
 class Running(NamedTuple):
     """A model with its state. Both kinds have a place, so that compiled code has one type for all models; one is empty.
 
     patch: of a patch model
+    contact: of a surface model
+    start, center: (n_tools, 3), m, of the spheres of a surface model: where their tools start, and where they are wanted
     """
 
     patch: FixedPatch
+    contact: SphereContact
+    start: Floats
+    center: Floats
 
     def state_size(self) -> int:
-        return self.patch.state_size()
+        return self.patch.state_size() + self.start.size + self.contact.state_size()
 
     def shown_size(self) -> int:
-        return self.patch.body.state.size
+        return self.patch.body.state.size + self.contact.shown_size()
 
     def restore(self, state: Floats) -> None:
         """Restore the state (state_size,) that `save` wrote, of the same model."""
-        self.patch.restore(state)
+        of_patch = self.patch.state_size()
+        of_contact = of_patch + self.start.size
+        self.patch.restore(state[:of_patch])
+        self.start.ravel()[:] = state[of_patch:of_contact]
+        self.contact.restore(state[of_contact:])
 
 
 def empty() -> Running:
     """No model: nothing that `advance` changes, and a state of size 0."""
-    return Running(fixed_patch.empty())
+    return of_patch(fixed_patch.empty())
+
+
+def of_patch(patch: FixedPatch) -> Running:
+    nowhere = np.zeros((0, 3))
+    return Running(patch, sphere_contact.empty(0), nowhere, nowhere)
+
+
+def of_contact(contact: SphereContact, start: Floats) -> Running:
+    """start (n_tools, 3), m"""
+    return Running(fixed_patch.empty(), contact, start, start.copy())
 
 
 @compiled
@@ -60,11 +97,25 @@ def advance(
     """
     if running.patch.normals.shape[0] > 0:
         fixed_patch.advance(running.patch, displacement, force, reactions)
+        ledger[0] = ledger[1] = 0.0
+    elif running.start.shape[0] > 0:
+        for i in range(displacement.shape[0]):
+            for j in range(3):
+                running.center[i, j] = running.start[i, j] + displacement[i, j]
+        sphere_contact.advance(running.contact, running.center, wanted, force, reactions)
+        sphere_contact.ledger(running.contact, ledger)
 
 
 @compiled
-def is_still(running: Running, displacement: Floats, force: Floats) -> bool:
-    """Whether nothing moves that anybody would notice, after the tick with this displacement and force, each (n, 3)."""
+def is_still(
+    running: Running, displacement: Floats, force: Floats, reactions: Records, ledger: Floats
+) -> bool:
+    """Whether nothing moves that anybody would notice, after the tick with these arrays of `advance`."""
+    if running.patch.normals.shape[0] == 0:
+        for i in range(reactions.shape[0]):
+            if reactions[i].flags & _IN_CONTACT:
+                return False
+        return ledger[0] <= _REST_ENERGY_J
     for i in range(force.shape[0]):
         for j in range(3):
             if displacement[i, j] != 0.0 or not abs(force[i, j]) <= _REST_FORCE_N:
@@ -73,17 +124,35 @@ def is_still(running: Running, displacement: Floats, force: Floats) -> bool:
 
 
 @compiled
+def set_tip(running: Running, tool: int, settings: Record) -> None:
+    """Give a tool that touches nothing the tip in its settings (SETTINGS). A tool of a patch model has none."""
+    if running.start.shape[0] > 0:
+        for j in range(3):
+            running.start[tool, j] = settings.start_m[j]
+        sphere_contact.set_tool(
+            running.contact, tool, settings.radius_m, settings.friction, settings.stiffness_n_per_m
+        )
+
+
+@compiled
 def put_to_rest(running: Running) -> None:
     fixed_patch.put_to_rest(running.patch)
+    sphere_contact.put_to_rest(running.contact)
 
 
 @compiled
 def save_shown(running: Running, state: Floats) -> None:
     """Write what the shown surface depends on into `state` (shown_size,)."""
     fixed_patch.save_shown(running.patch, state)
+    sphere_contact.save_shown(running.contact, state)
 
 
 @compiled
 def save(running: Running, state: Floats, place: int) -> int:
     """Write the state into `state` from `place` on. Returns the place behind it."""
-    return fixed_patch.save(running.patch, state, place)
+    place = fixed_patch.save(running.patch, state, place)
+    for i in range(running.start.shape[0]):
+        for j in range(3):
+            state[place] = running.start[i, j]
+            place += 1
+    return sphere_contact.save(running.contact, state, place)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.model_file import AccuracyReport, Contact, PoleResidueSystem, ReducedModel, StateSpace, Surface
 from palpate_server.coupling import fixed_patch
-from palpate_server.coupling.running import Running
+from palpate_server.coupling.running import Running, of_patch
 
 Floats = NDArray[np.float64]
 
@@ -67,7 +67,7 @@ def patches_of(system: StateSpace, displacement: Floats | None = None) -> Runnin
     """A running patch model of these matrices alone, at rest or settled at (n_tools, 3), m; its normals along z."""
     n = len(system.c) // 3
     normals = np.tile([0.0, 0.0, 1.0], (n, 1))
-    return Running(fixed_patch.make(system, normals, np.ones(n, np.int64), displacement))
+    return of_patch(fixed_patch.make(system, normals, np.ones(n, np.int64), displacement))
 
 
 def _state_spaces(

@@ -7,6 +7,7 @@ field has the name of the tuple's type, so that functions are compiled for that 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, call-arg, arg-type, override"
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,9 @@ from numba.core.typing.templates import AttributeTemplate
 from numba.extending import infer_getattr, intrinsic, lower_getattr_generic, models, register_model
 from numpy.typing import NDArray
 
-from palpate_server.realtime.compiled import compiled
-
 Image = NDArray[np.void]
 
-WORDS = 1024  # of 8 bytes: room for a hundred arrays
+WORDS = 4096  # of 8 bytes: room for four hundred arrays
 _TYPES: dict[str, types.Type] = {}
 
 
@@ -47,38 +46,39 @@ def _borrowed(context, builder, numba_type, value):
     return value
 
 
-@intrinsic
-def _store(typing_context, buffer, value):
-    def codegen(context, builder, signature, args):
-        buffer_type, tuple_type = signature.args
-        native = context.get_value_type(tuple_type)
-        if context.get_abi_sizeof(native) > 8 * WORDS:
-            raise ValueError("the tuple is larger than its image may be")
-        data = context.make_array(buffer_type)(context, builder, args[0]).data
-        pointer = builder.bitcast(data, native.as_pointer())
-        builder.store(_borrowed(context, builder, tuple_type, args[1]), pointer, align=8)
-        return context.get_dummy_value()
-
-    return types.void(buffer, value), codegen
-
-
-@compiled
-def _write(buffer: Image, value: tuple[Any, ...]) -> None:
-    _store(buffer, value)
-
-
 def make_image(arrays: tuple[Any, ...]) -> Image:
     """The native image of a (named, nested) tuple of arrays, valid for as long as the caller keeps the arrays.
 
-    Raises TypeError for a tuple whose type is not registered.
+    Raises TypeError for a tuple whose type is not registered, and ValueError for one that is larger than an image may be.
     """
     numba_type = typeof(arrays)
     for name, registered in _TYPES.items():
         if registered == numba_type:
+            words = list(_words(arrays))
+            if len(words) > WORDS:
+                raise ValueError(f"the tuple takes {len(words)} words, its image has {WORDS}")
             image = empty_image(name)
-            _write(image, arrays)
+            image[name][: len(words)] = words
             return image
     raise TypeError(f"no image is registered for {type(arrays).__name__} with these types of arrays")
+
+
+def _words(value: Any) -> Iterator[int]:
+    """The words of an array as numba has it in memory, without reference counts; of a tuple, those of its elements.
+
+    To have compiled code write them took a compilation of half a minute for some two hundred arrays.
+    """
+    if isinstance(value, tuple):
+        for element in value:
+            yield from _words(element)
+        return
+    yield from (0, 0, value.size, value.itemsize, value.ctypes.data)  # see ARRAY_MEMBERS
+    yield from value.shape
+    yield from value.strides
+
+
+ARRAY_MEMBERS = ("meminfo", "parent", "nitems", "itemsize", "data", "shape", "strides")
+"""Of numba's arrays in memory, each of one word but the last two, which have one a dimension."""
 
 
 class ViewType(types.Type):

@@ -22,6 +22,7 @@ class Change(IntEnum):
     RESET = 3  # the body and all tips are put to rest
     EXCHANGE = 4  # the memory goes on with another coupling
     SAVE = 5  # nothing: the state is saved, as it is by every change
+    TIP = 6  # of a tool that touches nothing: its radius, friction and stiffness, and where it starts
 
 
 _INTEGER, _FLOAT = np.int64, np.float64
@@ -52,9 +53,11 @@ SETTINGS = np.dtype(
         ("rotation", _FLOAT, (3, 3)),  # the frame, as in `frames`
         ("scale", _FLOAT),
         ("home_m", *_VECTOR),
-        ("radius_m", _FLOAT),  # of the sphere that touches a surface model, as are
+        # Of the sphere that touches a surface model, in the model:
+        ("radius_m", _FLOAT),
         ("friction", _FLOAT),
-        ("stiffness_n_per_m", _FLOAT),  # of the spring between device and sphere, in the model
+        ("stiffness_n_per_m", _FLOAT),  # of the spring between device and sphere
+        ("start_m", *_VECTOR),  # where its center is when the tool is at its start
     ]
 )
 """Limits and frame of a port, and what its tool is."""

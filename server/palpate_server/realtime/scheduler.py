@@ -156,6 +156,22 @@ def set_frame(image: Image, tool: int, rotation: Floats, scale: float, home: Flo
 
 
 @compiled
+def set_tip(image: Image, tool: int, tip: Floats, start: Floats) -> None:
+    """Ask for another tip of a silent tool of a surface model.
+
+    tip (3,): radius, m, friction, stiffness, N/m, as in `running.Tip`; start (3,), m
+    """
+    m = view(image)
+    settings = _prepare(m, tool)
+    settings.radius_m = tip[0]
+    settings.friction = tip[1]
+    settings.stiffness_n_per_m = tip[2]
+    for j in range(3):
+        settings.start_m[j] = start[j]
+    store_release(m.shared, CHANGE, Change.TIP)
+
+
+@compiled
 def _prepare(m: Memory, tool: int) -> Record:
     """The slot's settings, which are those of the tool until they are changed."""
     m.changes.port[0] = tool
@@ -219,6 +235,9 @@ def take_up_change(image: Image) -> None:
         for j in range(3):  # not so after a reset, where the device has not moved
             m.ports[tool].device_m[j] = m.settings[tool].home_m[j]
         put_to_rest(m, tool)
+    elif kind == Change.TIP:
+        m.settings[tool] = changes.settings[0]
+        cross_fade.set_tip(m.coupling, tool, m.settings[tool])
     elif kind == Change.RESET:
         put_tissue_to_rest(m)
         for i in range(m.ports.shape[0]):

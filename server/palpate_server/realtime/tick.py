@@ -166,7 +166,7 @@ def rendered_before(tick: int, rendered_tick: int) -> int:
 def _settle(m: Memory) -> None:
     """Zero the state exactly after _REST_TICKS quiet ticks."""
     counters = m.counters[0]
-    still = cross_fade.is_still(m.coupling, m.displacement, m.force)
+    still = cross_fade.is_still(m.coupling, m.displacement, m.force, m.reactions, m.ledger)
     counters.quiet_ticks = counters.quiet_ticks + 1 if still else 0
     if counters.quiet_ticks == _REST_TICKS:
         put_tissue_to_rest(m)

@@ -14,7 +14,12 @@ from palpate_server.recording.json_records import as_objects, from_objects
 
 def identity(model: Model) -> dict[str, Any]:
     """What tells a model from others in a recording."""
-    return {"name": model.name, "order": model.order, "config_sha256": model.config_sha256}
+    return {
+        "name": model.name,
+        "kind": model.kind,
+        "order": model.order,
+        "config_sha256": model.config_sha256,
+    }
 
 
 def as_message(memory: Memory, model: Model, following: Model | None) -> dict[str, Any]:

@@ -6,10 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from palpate_server.coupling.models import Model
+from palpate.model_file import ReducedModel
 from palpate_server.realtime.safety import Limits
 
 _CHAI3D = "CHAI3D 3 device specifications, github.com/chai3d/chai3d, src/devices"
+
+
+_MARGIN = 0.95  # of the stiffness at which Colgate's condition holds no more
 
 
 @dataclass(frozen=True)
@@ -61,8 +64,24 @@ def limits_for(profile: DeviceProfile, ceiling: Limits) -> Limits:
     )
 
 
-def warnings_for(device: Device, model: Model, tool: int, scale: float) -> list[str]:
-    """Why `device` may not render a tool (by index) of `model` stably; `scale` is that of the client's frame."""
+def coupling_stiffness(device: Device | None, period_s: float) -> float:
+    """The largest stiffness, N/m, at the device, of the spring between it and a sphere that touches a surface model.
+
+    That is the largest one that the device is good for, the generic one without a device. With the device's own damping b and
+    its round trip D, a sampled spring K is passive for b > K (T / 2 + D) (Colgate & Schenkel 1997). Tissue in series only
+    makes it softer.
+    """
+    if device is None:
+        return PROFILES["generic"].max_stiffness_n_per_m
+    stiffness = device.profile.max_stiffness_n_per_m
+    if device.damping_n_s_per_m is not None:
+        delay_s = device.round_trip_s or 0.0
+        stiffness = min(stiffness, _MARGIN * device.damping_n_s_per_m / (period_s / 2 + delay_s))
+    return stiffness
+
+
+def warnings_for(device: Device, model: ReducedModel, tool: int, scale: float) -> list[str]:
+    """Why `device` may not render a tool (by index) of a patch model stably; `scale` is that of the client's frame."""
     rows = slice(3 * tool, 3 * tool + 3)
     stiffness = float(np.linalg.norm(model.continuous.d[rows, rows], 2)) * scale**2
     warnings = stiffness_warnings(

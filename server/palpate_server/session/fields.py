@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -123,6 +123,25 @@ def device_in(request: dict[str, Any]) -> Device | None:
     if not (isinstance(name, str) and name in PROFILES):
         raise Refused("unknown_device", f"device is {shown(name)}: there are {', '.join(PROFILES)}")
     return Device(PROFILES[name], round_trip_s, damping)
+
+
+class TipWanted(NamedTuple):
+    """What a client asks for of the tips of its tools; None: as it is."""
+
+    radius_m: float | None = None
+    friction: float | None = None
+    stiffness_n_per_m: float | None = None
+
+
+AS_IT_IS = TipWanted()
+
+
+def tip_in(request: dict[str, Any]) -> TipWanted:
+    wanted = TipWanted(*(_optional_number(request, field) for field in TipWanted._fields))
+    for field in ("radius_m", "stiffness_n_per_m"):
+        if getattr(wanted, field) == 0:
+            raise Refused("out_of_range", f"{field} is 0: expected a number above 0")
+    return wanted
 
 
 def limits_in(request: dict[str, Any], known: tuple[str, ...]) -> dict[str, float]:

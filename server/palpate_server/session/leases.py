@@ -9,6 +9,7 @@ from palpate_client.messages import Frame, Vector
 from palpate_server.errors import Refused
 from palpate_server.realtime.safety import Limits
 from palpate_server.session.devices import Device
+from palpate_server.session.fields import AS_IT_IS, TipWanted
 
 
 @dataclass(frozen=True)
@@ -16,12 +17,14 @@ class ToolSettings:
     """The settings of a tool for its present or last holder.
 
     home_m  the client position at which the tip is at the tool's start
+    wanted  what the client asked for of its tip
     """
 
     limits: Limits
     frame: Frame
     home_m: Vector
     device: Device | None = None
+    wanted: TipWanted = AS_IT_IS
 
 
 class Leases:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from palpate.files import LONGEST_NAME_BYTES, is_plain_name
-from palpate.model_file import ModelFileError
+from palpate.model_file import ModelFileError, ReducedModel
 from palpate.model_file.advice import force_advice
 from palpate_server.coupling import cross_fade, models
 from palpate_server.coupling.models import Model
+from palpate_server.coupling.running import Tip
+from palpate_server.coupling.settle import Touch
 from palpate_server.errors import Refused
 from palpate_server.realtime import shared_memory
 from palpate_server.recording.snapshot import identity
@@ -19,6 +21,7 @@ from palpate_server.session.devices import warnings_for
 from palpate_server.session.fields import shown
 from palpate_server.session.model_process import load_model_elsewhere
 from palpate_server.session.state import SessionState
+from palpate_server.session.tips import tips_for
 
 log = logging.getLogger("palpate_server")
 
@@ -40,7 +43,8 @@ class ModelLoader:
         try:
             state.check_alone(client)
             model = self._read(file)
-            memory = self._fade_to(model)
+            tips = self._tips(model)
+            memory = self._fade_to(model, tips)
             with state.model_in_use:
                 self._end_exchange(memory, model)
             log.info("now serving %s (order %d)", model.name, model.order)
@@ -53,11 +57,16 @@ class ModelLoader:
         finally:
             state.exchanging.release()
 
-    def _fade_to(self, model: Model) -> shared_memory.Memory:
+    def _fade_to(self, model: Model, tips: Sequence[Tip]) -> shared_memory.Memory:
         """Cross-fade to a model that starts settled at the present displacement. Returns the memory to continue with."""
         state = self._state
         step = model.period_s / CROSS_FADE_S
-        following = models.make_settled(model, state.memory.displacement.copy())
+        memory = state.memory
+        displacement = memory.displacement.copy()
+        if away := models.off_the_patches(model, displacement):
+            raise Refused("bad_model", f"tool {away[0]!r} is not on its patch: bring it to its start first")
+        touch = Touch(memory.wanted.copy(), memory.reactions.copy())
+        following = models.make_settled(model, tips, displacement, touch)
         coupling = cross_fade.to_another(state.memory.coupling, following, step)
         fading = shared_memory.with_coupling(state.memory, coupling)
         memory = shared_memory.with_coupling(state.memory, cross_fade.after(coupling))
@@ -66,6 +75,15 @@ class ModelLoader:
             if state.stopping.wait(model.period_s):
                 raise Refused("stopping", "the server is stopping")
         return memory
+
+    def _tips(self, model: Model) -> tuple[Tip, ...]:
+        """The tips that the tools are to have on another model, as their holders asked for them. Raises Refused."""
+        try:
+            return tips_for(model, self._state.leases.settings)
+        except Refused as error:
+            raise Refused(
+                "bad_model", f"{model.name!r} can't be touched as it was asked for: {error}"
+            ) from error
 
     def _end_exchange(self, memory: shared_memory.Memory, model: Model) -> None:
         """Drop the old model. Ticks may be late, so this is tried until it succeeds or the server stops."""
@@ -113,7 +131,7 @@ def warnings_of(state: SessionState, tools: Iterable[str]) -> list[str]:
     warnings: list[str] = []
     for name in tools:
         settings = state.leases.settings[name]
-        if settings.device is not None:
+        if settings.device is not None and isinstance(state.model, ReducedModel):  # others are soft enough
             index = state.tool_index[name]
             warnings += warnings_for(settings.device, state.model, index, settings.frame.scale)
     return list(dict.fromkeys(warnings))  # tools are often alike

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate_client.messages import Frame
 from palpate_server.coupling import models
+from palpate_server.coupling.running import Tip
 from palpate_server.errors import Refused
 from palpate_server.realtime import safety, scheduler
 from palpate_server.realtime.safety import Limits
@@ -22,6 +22,7 @@ from palpate_server.session.leases import ToolSettings
 from palpate_server.session.loading import ModelLoader, warnings_of
 from palpate_server.session.recordings import Recordings
 from palpate_server.session.state import SessionState
+from palpate_server.session.tips import tip_for, tip_message
 
 log = logging.getLogger("palpate_server")
 
@@ -87,6 +88,7 @@ class Requests:
         tools = fields.tools_in(request)
         frame = fields.frame_in(request)
         device = fields.device_in(request)
+        wanted = fields.tip_in(request)
         state, leases = self._state, self._state.leases
         state.check_running()
         self._check_alive(client)
@@ -95,15 +97,24 @@ class Requests:
         if not state.exchanging.acquire(blocking=False):
             raise Refused("busy", "another model is being loaded")
         try:
+            described = {tool.name: tool for tool in models.tools_of(state.model)}
+            tips = {name: tip_for(state.model, name, wanted, device, frame.scale) for name in tools}
             self._silence(tools)
-            for name in tools:
-                self._set_up(name, limits, frame, device)
+            for name, tip in tips.items():
+                start = described[name].start_m if tip is None else tip.start_m
+                home = frame.point_at_client(start)
+                self._set_up(name, ToolSettings(limits, frame, home, device, wanted), tip)
             leases.holders |= dict.fromkeys(tools, client)
         finally:
             state.exchanging.release()
         return {
             "tools": {
-                name: {"limits": limits._asdict(), "home_m": leases.settings[name].home_m} for name in tools
+                name: {
+                    "limits": limits._asdict(),
+                    "home_m": leases.settings[name].home_m,
+                    **tip_message(state.model, name, leases.settings[name]),
+                }
+                for name in tools
             },
             "frame": asdict(frame),
             "warnings": warnings_of(state, tools),
@@ -132,19 +143,21 @@ class Requests:
                 raise Refused("busy", "the force did not fade in time: the server is overloaded")
             time.sleep(state.model.period_s)
 
-    def _set_up(self, name: str, limits: Limits, frame: Frame, device: Device | None) -> None:
-        """Put a silent tool to rest in a client's frame, with these limits."""
+    def _set_up(self, name: str, wanted: ToolSettings, tip: Tip | None) -> None:
+        """Put a silent tool to rest with these settings and this tip."""
         state = self._state
-        tool = state.tool_index[name]
-        home = frame.point_at_client(models.tools_of(state.model)[tool].start_m)
+        tool, frame = state.tool_index[name], wanted.frame
         settings = (
             state.leases.settings
-        )  # updated after each change, so that they are right even if the second change fails
-        state.between_ticks(scheduler.set_frame, tool, np.array(frame.rotation), frame.scale, np.array(home))
-        settings[name] = ToolSettings(settings[name].limits, frame, home, device)
-        # The tip is at rest, so the limits may change a tick later than the frame.
-        state.between_ticks(scheduler.set_limits, tool, np.array(limits))
-        settings[name] = replace(settings[name], limits=limits)
+        )  # updated after each change, so that they are right even if the next change fails
+        home = np.array(wanted.home_m)
+        state.between_ticks(scheduler.set_frame, tool, np.array(frame.rotation), frame.scale, home)
+        settings[name] = replace(wanted, limits=settings[name].limits)
+        # The tip is at rest, so limits and tip may change a tick later than the frame.
+        state.between_ticks(scheduler.set_limits, tool, np.array(wanted.limits))
+        settings[name] = wanted
+        if tip is not None:
+            state.between_ticks(scheduler.set_tip, tool, np.array(tip[:3]), np.array(tip.start_m))
 
     def _set_limits(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
         state, settings = self._state, self._state.leases.settings
@@ -191,5 +204,5 @@ class Requests:
         released = leases.release(client)
         self._state.forget_commands(released)
         for name in released:  # limits and frame stay in use until the next acquire
-            leases.settings[name] = replace(leases.settings[name], device=None)
+            leases.settings[name] = replace(leases.settings[name], device=None, wanted=fields.AS_IT_IS)
         return released

@@ -19,6 +19,7 @@ from palpate_server.realtime.safety import Limits
 from palpate_server.recording import snapshot
 from palpate_server.recording.recorder import Recorder
 from palpate_server.session.leases import Leases, ToolSettings
+from palpate_server.session.tips import tips_for
 
 CHANGE_TIMEOUT_S = 1.0
 
@@ -61,14 +62,13 @@ class SessionState:
         self.tools = tuple(tool.name for tool in tools)
         self.tool_index = {name: i for i, name in enumerate(self.tools)}
         homes = [tool.start_m for tool in tools]
+        self.leases = Leases({tool.name: ToolSettings(limits, Frame(), tool.start_m) for tool in tools})
+        running = models.make_running(model, tips_for(model, self.leases.settings))
         self.memory = shared_memory.make_memory(
-            models.make_running(model), model.period_s, [limits] * len(tools), surface_period_s, homes
+            running, model.period_s, [limits] * len(tools), surface_period_s, homes
         )
         self.lease_numbers = [0] * len(self.tools)
         self.image = make_image(self.memory)
-        self.leases = Leases(
-            {name: ToolSettings(limits, Frame(), home) for name, home in zip(self.tools, homes, strict=True)}
-        )
         self.messages = MessageCounters()
         self.running = True
         self.stopping = threading.Event()

@@ -16,6 +16,7 @@ from palpate_server.realtime.records import RECORDS
 from palpate_server.recording.snapshot import identity
 from palpate_server.session.devices import PROFILES
 from palpate_server.session.state import MessageCounters, SessionState
+from palpate_server.session.tips import tip_message
 
 STATUS_PERIOD_S = 0.1
 ROLLING_TICKS = 100
@@ -106,13 +107,14 @@ def _tool_status(state: SessionState, name: str) -> dict[str, Any]:
         "limits": settings.limits._asdict(),
         "frame": asdict(settings.frame),
         "home_m": settings.home_m,
+        **tip_message(state.model, name, settings),
     }
 
 
 def description(state: SessionState) -> dict[str, Any]:
     """The answer to `describe`."""
     summary = state.model.summary()
-    summary["accuracy"].pop("hankel_singular_values")
+    summary["accuracy"].pop("hankel_singular_values", None)
     return {
         "kind": Kind.DESCRIBE,
         "schema_version": SCHEMA_VERSION,
@@ -124,6 +126,7 @@ def description(state: SessionState) -> dict[str, Any]:
                 "start_m": tool.start_m,
                 "normal": tool.normal,
                 "radius_m": tool.radius_m,
+                "friction": tool.friction,
             }
             for tool in models.tools_of(state.model)
         ],

@@ -9,9 +9,11 @@ import threading
 import numpy as np
 
 from palpate_server import codec
-from palpate_server.coupling import running
+from palpate_server.coupling import running, settle
+from palpate_server.coupling.settle import Touch
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
+from palpate_server.realtime.records import REACTION
 from palpate_server.realtime.safety import Limits
 
 log = logging.getLogger("palpate_server")
@@ -43,12 +45,14 @@ def _call_each(period_s: float, n_tools: int) -> None:
     scheduler.is_silent(image, 0)
     scheduler.set_frame(image, 0, np.eye(3), 1.0, np.zeros(3))
     scheduler.set_limits(image, 0, np.ones(len(Limits._fields)))
+    scheduler.set_tip(image, 0, np.ones(3), np.zeros(3))
     scheduler.reset(image)
     scheduler.save(image)
     scheduler.exchange(image, make_image(memory))
     scheduler.is_changed(image)
     scheduler.withdraw_change(image)
     scheduler.read_snapshot(image, np.zeros(0), np.zeros((n_tools, 3)))
+    settle.press(running.empty(), np.zeros((0, 3)), Touch(np.zeros(0, np.int64), np.zeros(0, REACTION)), [])
     scheduler.stop(memory.shared)
     wake = os.eventfd(0)
     scheduler.run_at_deadlines(image, wake)
