@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 
-from palpate.model_file import ReducedModel
+from palpate.model_file import ReducedModel, SurfaceAccuracy, SurfaceModel, ToolShape
 from palpate_server.diagnostics.sample_model import spring_mass_model
+from palpate_server.diagnostics.sample_surface import half_space_model
 
 SLAB = """
 name = "slab"
@@ -45,6 +48,27 @@ def slab_scene() -> Callable[..., str]:
         return SLAB + "".join(tables) + more
 
     return scene
+
+
+@pytest.fixture(scope="session")
+def make_surface_model() -> Callable[..., SurfaceModel]:
+    """A half-space that is touched by `tip` and, with two tools, 12 mm beside it by `tip1`; its stated errors are zero."""
+
+    def make(n_tools: int = 1, softness: float = 1.0, friction: float = 0.3) -> SurfaceModel:
+        tools = [
+            ToolShape(f"tip{i}" if i else "tip", 0.005, friction, (0.012 * i, 0.0, 0.02))
+            for i in range(n_tools)
+        ]
+        model = half_space_model(
+            tools, 13, young_pa=1e4 / softness, prony=((0.5, 0.3), (0.005, 0.5)), n_modes=6
+        )
+        zeros = dict.fromkeys((f.name for f in fields(SurfaceAccuracy)), 0.0)
+        accuracy = SurfaceAccuracy(**zeros | {"error_map": np.zeros(model.n_points, np.float32)})
+        return replace(
+            model, n_nodes=model.n_points, accuracy=accuracy, config_sha256="5f" * 32, built_with="the tests"
+        )
+
+    return make
 
 
 @pytest.fixture(scope="session")

@@ -182,10 +182,12 @@ class Connection:
         position_m: Mapping[str, list[float]],
         velocity_m_per_s: Mapping[str, list[float]] | None = None,
         rendered_tick: int | None = None,
+        attach: Mapping[str, bool] | None = None,
         on_sending: Callable[[int, int], None] | None = None,
     ) -> int:
         """Send a command: position, m, and velocity, m/s, of tools by name, in the frame that was acquired; its sequence.
 
+        attach: of each tool by name, whether it holds the tissue under it.
         on_sending(sequence, client_time_ns) is called right before it is sent.
         """
         self._sequence += 1
@@ -197,6 +199,7 @@ class Connection:
             "position_m": position_m,
             "velocity_m_per_s": velocity_m_per_s,
             "rendered_tick": rendered_tick,
+            "attach": attach,
         }
         if on_sending is not None:
             on_sending(sequence, now_ns)

@@ -61,6 +61,7 @@ class Tool:
         self._silence_s = silence_s
         self._since_s = time.monotonic()
         self._rendered_tick: int | None = None
+        self._attached = False
         self._forces: Subscription = None
 
     def __enter__(self) -> Tool:
@@ -108,7 +109,19 @@ class Tool:
         if velocity_m_per_s is not None:
             velocity = {self.name: _vector("velocity_m_per_s", velocity_m_per_s)}
         position = {self.name: _vector("position_m", position_m)}
-        self._connection.send(position, velocity, self._rendered_tick, self.contract.on_sending)
+        attach = {self.name: True} if self._attached else None
+        self._connection.send(position, velocity, self._rendered_tick, attach, self.contract.on_sending)
+
+    def attach(self) -> None:
+        """Hold the tissue under the tip from the next `move` on, as soon as it touches: it can be pulled then.
+
+        A patch model ignores this; its tips are attached always.
+        """
+        self._attached = True
+
+    def let_go(self) -> None:
+        """Let the tissue go from the next `move` on."""
+        self._attached = False
 
     def take_force(self) -> Vector:
         """The force to render now, N, in our frame: the newest one while it is fresh, otherwise zero.
@@ -163,6 +176,7 @@ class Tool:
         self.home_m = x, y, z
         self.warnings = answer["warnings"]
         self.newest = None
+        self._attached = False
         self._since_s = time.monotonic()
         self._rendered_tick = None
         self.contract.acquired(self.limits["max_force_n"])

@@ -17,7 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import zenoh
 
 from palpate.files import make_folder, printable
-from palpate.model_file import ModelFileError, load_patch_model
+from palpate.model_file import ModelFileError, load_model
 from palpate_client.arguments import positive, positive_up_to
 from palpate_client.wire import DEFAULT_ENDPOINT, DEFAULT_SESSION, Keys
 from palpate_server.arguments import index, need
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         keys = Keys(options.session)
         how = _server_options(options)
-        model = load_patch_model(options.model)
+        model = load_model(options.model)
         for warning in accuracy_warnings(model):
             log.warning("%s", warning)
         with transport.open_session(options.listen, options.zenoh_config) as session:

@@ -25,7 +25,7 @@ import msgpack
 import pytest
 import zenoh
 
-from palpate.model_file import ReducedModel, save_model
+from palpate.model_file import ReducedModel, SurfaceModel, save_model
 from palpate_client.local_server import free_endpoint
 from palpate_client.wire import FORCE_FIELDS, KEEP_ALIVES, LEASE_MS, PER_TICK
 from palpate_server.diagnostics.sample_model import spring_mass_model
@@ -149,7 +149,7 @@ class ServedModel:
 
     program: Program
     endpoint: str
-    model: ReducedModel
+    model: Any
 
     @property
     def process(self) -> subprocess.Popen[bytes]:
@@ -166,9 +166,10 @@ def _serve(
     n_contacts: int = 1,
     n_modes: int = 20,
     listen: bool = True,
+    model: ReducedModel | SurfaceModel | None = None,
 ) -> ServedModel:
-    """A server of its own for the file model{n_contacts}.npz in a folder. Without `listen` the options say where."""
-    model = spring_mass_model(n_contacts, n_modes)
+    """A server of its own for the file model{n_contacts}.npz in a folder, or for `model`. Without `listen` the options say where."""
+    model = model or spring_mass_model(n_contacts, n_modes)
     path = folder / f"model{n_contacts}.npz"
     save_model(model, path)
     endpoint = free_endpoint()

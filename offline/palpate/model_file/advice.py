@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from palpate.model_file.surface_model import SurfaceModel
 from palpate.model_file.types import ReducedModel
 
 NOTABLE_ERROR = 0.1
@@ -18,8 +19,24 @@ def what_to_change(method: str) -> str:
     return "raise the order" if method == "tbr-band" else "raise the order or use tbr-band"
 
 
-def force_advice(model: ReducedModel) -> list[str]:
+def force_advice(model: ReducedModel | SurfaceModel) -> list[str]:
     """A sentence for each notable error of the force, with what to do; empty for a good model."""
+    return _of_surface(model) if isinstance(model, SurfaceModel) else _of_patches(model)
+
+
+def _of_surface(model: SurfaceModel) -> list[str]:
+    accuracy, (low, high) = model.accuracy, model.band_hz
+    return [
+        f"Force {where}: wrong by {percent(error)}; raise the number of modes."
+        for error, where in (
+            (accuracy.error_in_working_area, f"in {low:g}-{high:g} Hz in the working area"),
+            (accuracy.error_static, "at rest"),
+        )
+        if not error <= NOTABLE_ERROR  # NaN is notable
+    ]
+
+
+def _of_patches(model: ReducedModel) -> list[str]:
     accuracy, found = model.accuracy, []
     low, high = accuracy.band_hz
     for error, where in (

@@ -81,6 +81,8 @@ def advance(patch: FixedPatch, displacement: Floats, force: Floats, reactions: R
             patch.before[i, j] = displacement[i, j]
         reaction.penetration_m = depth
         reaction.n_contact_points = patch.n_nodes[i]
+        reaction.flags = 0  # what another model wrote before does not stay
+        reaction.slip_m = reaction.stored_j = reaction.dissipated_j = 0.0
         reaction.work_j = patch.work[i]
 
 

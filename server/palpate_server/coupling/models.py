@@ -93,15 +93,21 @@ def off_the_patches(model: Model, displacement: Floats) -> list[str]:
     return away
 
 
+def tips_of_file(model: Model) -> tuple[Tip, ...]:
+    """The tips of the tools of a surface model as its file has them; none for a patch model."""
+    return tuple(
+        Tip(tool.radius_m, tool.friction, DEFAULT_STIFFNESS_N_PER_M, tool.start_m)
+        for tool in tools_of(model)
+        if tool.friction is not None
+    )
+
+
 def make_running(model: Model, tips: Sequence[Tip] | None = None) -> Running:
     """The model at rest; tips: of each tool of a surface model, by default as its file has them."""
     if isinstance(model, ReducedModel):
         return _patches(model, None)
     if tips is None:
-        tips = [
-            Tip(tool.radius_m, tool.friction, DEFAULT_STIFFNESS_N_PER_M, start_of(model, i, tool.radius_m))
-            for i, tool in enumerate(model.tools)
-        ]
+        tips = tips_of_file(model)
     contact = sphere_contact.make(model, [tip.stiffness_n_per_m for tip in tips])
     contact.tools.radius[:] = [tip.radius_m for tip in tips]
     contact.tools.friction[:] = [tip.friction for tip in tips]

@@ -34,7 +34,7 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader
 
 from palpate.files import printable
-from palpate.model_file import ModelFileError, load_patch_model
+from palpate.model_file import ModelFileError, load_model
 from palpate_client.wire import Flags
 from palpate_server.coupling import cross_fade, models
 from palpate_server.coupling.models import Model
@@ -265,7 +265,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         recorded = read_recording(options.recording)
-        result = compare(recorded, [load_patch_model(path) for path in options.models])
+        result = compare(recorded, [load_model(path) for path in options.models])
     except (OSError, ReplayError, ModelFileError) as error:
         print(printable(f"palpate replay: {error}"), file=sys.stderr)
         return 2

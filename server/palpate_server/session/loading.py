@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.files import LONGEST_NAME_BYTES, is_plain_name
-from palpate.model_file import ModelFileError, ReducedModel
+from palpate.model_file import ModelFileError, ReducedModel, SurfaceModel
 from palpate.model_file.advice import force_advice
 from palpate_server.coupling import cross_fade, models
 from palpate_server.coupling.models import Model
@@ -63,7 +63,7 @@ class ModelLoader:
         step = model.period_s / CROSS_FADE_S
         memory = state.memory
         displacement = memory.displacement.copy()
-        if away := models.off_the_patches(model, displacement):
+        if isinstance(state.model, SurfaceModel) and (away := models.off_the_patches(model, displacement)):
             raise Refused("bad_model", f"tool {away[0]!r} is not on its patch: bring it to its start first")
         touch = Touch(memory.wanted.copy(), memory.reactions.copy())
         following = models.make_settled(model, tips, displacement, touch)

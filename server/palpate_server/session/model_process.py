@@ -20,7 +20,7 @@ import threading
 import time
 from pathlib import Path
 
-from palpate.model_file import ModelFileError, load_patch_model
+from palpate.model_file import ModelFileError, load_model
 from palpate_server.coupling.models import Model
 
 _TIMEOUT_S = 60.0
@@ -33,7 +33,7 @@ _HEAD = struct.Struct("<QQ")  # bytes of the pickle, number of arrays; then the 
 
 
 def load_model_elsewhere(path: Path, stopping: threading.Event) -> Model:
-    """The model in a file, as `load_patch_model` gives it, its arrays read-only.
+    """The model in a file, as `load_model` gives it, its arrays read-only.
 
     Raises ModelFileError for what is no model, takes too long, or when `stopping` is set meanwhile; OSError.
     """
@@ -97,7 +97,7 @@ def main() -> int:
     os.nice(_NICE)
     resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY_BYTES, _MOST_MEMORY_BYTES))
     try:
-        _send(load_patch_model(path), descriptor)
+        _send(load_model(path), descriptor)
     except (OSError, RuntimeError, ModelFileError) as error:
         print(error, file=sys.stderr)
         return _EXIT_REFUSED

@@ -12,6 +12,8 @@ import pytest
 from palpate.model_file import ReducedModel
 from palpate_client.wire import Keys, pack
 from palpate_server.coupling import cross_fade, models
+from palpate_server.coupling.models import Model
+from palpate_server.coupling.settle import Touch
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import Limits
@@ -24,9 +26,9 @@ LIMITS = Limits(10.0, 2000.0, 1.0, 0.1, 5.0)
 class Loop:
     """Ticks of a model with passivity control; each change of settings is told to the recorder, as a session does."""
 
-    def __init__(self, model: ReducedModel) -> None:
+    def __init__(self, model: Model) -> None:
         self.model, self.following = model, None
-        limits = [LIMITS] * len(model.contacts)
+        limits = [LIMITS] * len(models.tools_of(model))
         self.memory = shared_memory.make_memory(models.make_running(model), model.period_s, limits, 1.0)
         self.image = make_image(self.memory)
         self.random = np.random.default_rng(1)
@@ -37,7 +39,9 @@ class Loop:
     def tick(self) -> int:
         return int(self.memory.counters["ticks"][0])
 
-    def run(self, ticks: int, *, commanded: bool = True, told: int = 3, by_m: float = 1e-3) -> None:
+    def run(
+        self, ticks: int, *, commanded: bool = True, told: int = 3, by_m: float = 1e-3, attach: bool = False
+    ) -> None:
         """Some ticks, each with a new command for all tools, which tells the force of `told` ticks before, or without."""
         for _ in range(ticks):
             now = (self.tick + 1) * 1_000_000
@@ -50,6 +54,7 @@ class Loop:
                     home = self.memory.settings["home_m"][tool]
                     command["position_m"] = home + self.random.normal(size=3) * by_m
                     command["velocity_m_per_s"] = (0.01, 0.0, 0.0)
+                    command["attach"] = attach
                 assert scheduler.hand_over(self.image, len(self.memory.ports)) == 0
             scheduler.repeat_tick(self.image, now, now, False)
 
@@ -63,9 +68,11 @@ class Loop:
         if self.recorder is not None:
             self.recorder.settings(snapshot.as_message(self.memory, self.model, self.following))
 
-    def load(self, model: ReducedModel) -> None:
+    def load(self, model: Model) -> None:
         """Fade over to another model within 100 ticks."""
-        following = models.make_settled(model, self.memory.displacement.copy())
+        touch = Touch(self.memory.wanted.copy(), self.memory.reactions.copy())
+        displacement = self.memory.displacement.copy()
+        following = models.make_settled(model, models.tips_of_file(model), displacement, touch)
         coupling = cross_fade.to_another(self.memory.coupling, following, 0.01)
         self._exchange(coupling, self.model, model)
         self.run(100)

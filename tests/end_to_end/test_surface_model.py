@@ -1,0 +1,255 @@
+"""A surface model served by a second process: forces, two clients, grip, cross-fades, recordings, devices."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.model_file import ReducedModel, SurfaceModel, save_model
+from palpate_client import Connection, Tool, steps
+from palpate_client.wire import Flags
+from palpate_server.coupling.models import tools_of
+from palpate_server.recording import replay
+from palpate_server.session.devices import PROFILES
+from palpate_server.simulation import Simulation
+
+CONTACT = Flags.IN_CONTACT | Flags.SLIDING | Flags.ATTACHED
+
+
+def assert_all_is_repeated(path: Path, *models: Any) -> replay.Recorded:
+    recorded = replay.read_recording(path)
+    result = replay.compare(recorded, models)
+    assert result.difference is None
+    assert result.ticks == result.of == len(recorded.ticks)
+    assert result.with_force > 50
+    return recorded
+
+
+def test_pokes_and_a_slide_through_the_wire_are_those_of_the_simulation_bit_for_bit(
+    serve: Callable[..., Any],
+    connect: Callable[..., Any],
+    make_surface_model: Callable[..., SurfaceModel],
+    tmp_path: Path,
+) -> None:
+    model = make_surface_model()
+    served = serve("--recordings", str(tmp_path), model=model)
+    with connect(served.endpoint) as client:
+        assert client.acquire("tip")[0]
+        home = client.next_status()["tools"]["tip"]["home_m"]
+        assert home == list(tools_of(model)[0].start_m)
+        client.record("a.mcap")
+        times = [0, 300, 400, 450, 550, 650, 800, 900]
+        for i in range(1000):
+            height = 1e-3 * np.interp(i, times, [1.0, 1.0, -2.0, 1.0, -2.0, -2.0, -1.0, 2.0])
+            along = 1e-3 * np.interp(i, [600, 850], [0.0, 8.0])
+            client.command({"tip": [home[0] + along, home[1], home[2] + height]})
+            time.sleep(1e-3)
+        assert client.control("record", file=None)[0]
+        received = {message["tick"]: message for message in client.forces}
+    recorded = assert_all_is_repeated(tmp_path / "a.mcap", model)
+
+    simulation = Simulation(model, PROFILES["generic"].max_stiffness_n_per_m)
+    simulation._contact.tick[0] = recorded.ticks["tick"][0]  # points a bit away are looked at in turns
+    flags, compared = 0, 0
+    for tick, (record,) in zip(recorded.ticks, recorded.ports, strict=True):
+        where = home + (record["position_m"] - home)
+        named = {"tip": where} if record["force_scale"] > 0 else {}
+        reaction = simulation.step(named).get("tip")
+        message = received.get(int(tick["tick"]))
+        if message is None or reaction is None or record["force_scale"] < 1:
+            continue
+        compared += 1
+        flags |= message["flags"][0]
+        assert message["force_n"][0] == reaction.force_n.tolist()
+        assert message["normal"][0] == reaction.normal.tolist()
+        assert message["n_contact_points"][0] == reaction.n_points
+        assert message["work_j"][0] == reaction.work_j
+        assert np.dot(message["force_n"][0], message["normal"][0]) >= 0  # it never pulls
+    assert compared > 300
+    assert flags & CONTACT == Flags.IN_CONTACT | Flags.SLIDING
+
+
+def test_two_clients_with_one_tool_each_feel_each_other(
+    serve: Callable[..., Any], connect: Callable[..., Any], make_surface_model: Callable[..., SurfaceModel]
+) -> None:
+    model = make_surface_model(2)
+    served = serve(model=model)
+    one, other = ([*tool.start_m] for tool in tools_of(model))
+
+    def below(start: list[float], depth_m: float) -> list[float]:
+        return [start[0], start[1], start[2] - depth_m]
+
+    with connect(served.endpoint) as first, connect(served.endpoint) as second:
+        for client, tool in ((first, "tip"), (second, "tip1")):
+            granted, answer = client.acquire(tool)
+            assert granted, answer
+
+        def felt() -> float:
+            """What the first one feels, by the mean of some ticks."""
+            count = len(first.forces)
+            first.force_when(lambda force: len(first.forces) > count + 50, "some ticks")
+            return float(np.mean([force["force_n"][0][2] for force in first.forces[-50:]]))
+
+        with first.pressing({"tip": below(one, -1e-3)}):
+            first.force_when(lambda force: force["force_scale"][0] == 1.0, "the end of the soft start")
+        with first.pressing({"tip": below(one, 2e-3)}):
+            first.force_when(lambda force: force["flags"][0] & Flags.IN_CONTACT, "contact")
+            with second.pressing({"tip1": below(other, -2e-3)}):
+                second.force_when(lambda force: force["force_scale"][1] == 1.0, "the other's soft start")
+                alone = felt()
+            with second.pressing({"tip1": below(other, 4e-3)}):
+                second.force_when(lambda force: force["n_contact_points"][1] > 2, "the other's contact")
+                beside = felt()
+    assert alone > 0.02
+    assert abs(beside - alone) > 0.05 * alone
+
+
+def test_the_python_client_holds_the_tissue_pulls_it_and_lets_it_go(
+    serve: Callable[..., Any], make_surface_model: Callable[..., SurfaceModel]
+) -> None:
+    served = serve(model=make_surface_model())
+    forces = []
+    with Connection(served.endpoint, "test") as connection, Tool(connection) as tool:
+        connection.on_tool_force(tool.name, forces.append)
+        for i in steps(1.6, 1e-3):
+            tool.move(tool.at_depth(1e-3 * np.interp(i, [250, 350, 700, 1000], [-1.0, 2.0, 2.0, -1.0])))
+            if i == 500:
+                tool.attach()
+            if i == 1300:
+                tool.let_go()
+    attached = [force for force in forces if force.flags & Flags.ATTACHED]
+    assert min(force.force_n[2] for force in attached) < -0.01
+    assert not forces[-1].flags & CONTACT
+    assert tuple(forces[-1].force_n) == (0.0, 0.0, 0.0)
+    assert all(force.force_n[2] > -1e-9 for force in forces[: forces.index(attached[0])])
+    assert tool.contract.broken == []
+
+
+def test_what_a_device_can_render_decides_how_stiff_the_coupling_is(
+    serve: Callable[..., Any], connect: Callable[..., Any], make_surface_model: Callable[..., SurfaceModel]
+) -> None:
+    served = serve(model=make_surface_model())
+    with connect(served.endpoint) as client:
+
+        def tip(**fields: Any) -> dict[str, Any]:
+            granted, answer = client.acquire("tip", **fields)
+            assert granted, answer
+            assert answer["warnings"] == []
+            told = {
+                name: answer["tools"]["tip"][name] for name in ("radius_m", "friction", "stiffness_n_per_m")
+            }
+            status = client.status_when(
+                lambda status: status["tools"]["tip"]["stiffness_n_per_m"] == told["stiffness_n_per_m"], "it"
+            )
+            assert told == {name: status["tools"]["tip"][name] for name in told}
+            return told | {"home_m": answer["tools"]["tip"]["home_m"]}
+
+        assert tip()["stiffness_n_per_m"] == 700.0
+        assert tip(device="omega")["stiffness_n_per_m"] == 5000.0
+        damped = {"device": "touch", "device_damping_n_s_per_m": 0.3, "round_trip_s": 0.0025}
+        # K (T / 2 + D) < b, Colgate & Schenkel
+        stiffness = tip(**damped)["stiffness_n_per_m"]
+        assert 0.9 * 0.3 / 0.003 < stiffness < 0.3 / 0.003
+        assert tip(**damped, stiffness_n_per_m=50.0)["stiffness_n_per_m"] == 50.0
+        assert tip(frame={"scale": 2.0})["stiffness_n_per_m"] == pytest.approx(700.0)
+        smaller = tip(radius_m=0.004, friction=0.0)
+        assert (smaller["radius_m"], smaller["friction"]) == (0.004, 0.0)
+        assert smaller["home_m"] == pytest.approx([0.0, 0.0, 0.004])
+        for fields in (
+            {"radius_m": 0.006},
+            {"radius_m": 0},
+            {"friction": 3.0},
+            {"stiffness_n_per_m": 701.0},
+            {"device": "touch", "device_damping_n_s_per_m": 0.0},
+        ):
+            granted, answer = client.acquire("tip", **fields)
+            assert (granted, answer["reason"]) == (False, "out_of_range"), fields
+            assert any(name in answer["message"] for name in fields)
+
+
+def test_the_headless_client_and_the_bridge_run_unchanged(
+    serve: Callable[..., Any],
+    run_example: Callable[..., Any],
+    make_surface_model: Callable[..., SurfaceModel],
+) -> None:
+    served = serve(model=make_surface_model())
+    code, out, err = run_example("palpate_client.poke", served.endpoint, "--duration-s", "1").finish()
+    assert code == 0, err
+    assert "contract           held" in out
+    code, out, err = run_example("device_bridge.py", served.endpoint, "--duration-s", "2").finish()
+    assert (code, err) == (0, ""), err  # no warning either
+
+
+def test_models_of_both_kinds_are_loaded_in_turns_while_the_tool_presses_and_all_is_repeated(
+    serve: Callable[..., Any],
+    connect: Callable[..., Any],
+    make_surface_model: Callable[..., SurfaceModel],
+    make_spring_mass_model: Callable[..., ReducedModel],
+    tmp_path: Path,
+) -> None:
+    surface, softer = make_surface_model(), make_surface_model(softness=2.0)
+    softer = replace(softer, name="softer", config_sha256="6f" * 32)
+    patch = make_spring_mass_model(1, 20)
+    # Its patch is where the sphere touches.
+    patch = replace(patch, contacts=(replace(patch.contacts[0], radius_m=0.01),))
+    for name, model in (("softer", softer), ("patch", patch), ("surface", surface)):
+        save_model(model, tmp_path / f"{name}.npz")
+    served = serve("--recordings", str(tmp_path), model=surface)
+    with connect(served.endpoint) as client:
+        granted, answer = client.acquire("tip")
+        x, y, z = answer["tools"]["tip"]["home_m"]
+        with client.pressing({"tip": [x, y, z + 1e-3]}):
+            client.force_when(lambda force: force["force_scale"] == [1.0], "the end of the soft start")
+        client.record("a.mcap")
+        with client.pressing({"tip": [x, y, z - 2e-3]}):
+            client.force_when(lambda force: force["flags"][0] & Flags.IN_CONTACT, "contact")
+            kinds = []
+            for name in ("softer", "patch", "surface"):
+                granted, answer = client.control("load", file=f"{name}.npz")
+                assert granted, answer
+                kinds.append(answer["model"]["kind"])
+                geometry = client.query("geometry")[1]
+                surfaces: list[Any] = []
+                key = client.key("surface")
+                subscriber = client.session.declare_subscriber(key, surfaces.append)
+                deadline = time.monotonic() + 60
+                while not surfaces and time.monotonic() < deadline:
+                    time.sleep(0.01)
+                subscriber.undeclare()
+                assert len(geometry["vertices_m"]) == 12 * geometry["n_vertices"]
+                assert surfaces, "a surface"
+            assert kinds == ["surface", "patch", "surface"]
+            end = client.force_when(lambda force: True, "a force")
+        assert client.control("record", file=None)[0]
+    assert end["flags"][0] & Flags.IN_CONTACT
+    assert end["force_n"][0][2] > 0.01
+    recorded = assert_all_is_repeated(tmp_path / "a.mcap", surface, softer, patch)
+    limit = 2000.0 * 1e-3  # N, --max-force-rate-n-per-s
+    assert np.linalg.norm(np.diff(recorded.ports["force_n"][:, 0], axis=0), axis=1).max() < 0.02 * limit
+
+
+def test_a_tool_that_is_lost_while_it_presses_fades_and_is_lifted_off(
+    serve: Callable[..., Any], connect: Callable[..., Any], make_surface_model: Callable[..., SurfaceModel]
+) -> None:
+    served = serve(model=make_surface_model())
+    with connect(served.endpoint) as watcher:
+        with connect(served.endpoint) as client:
+            x, y, z = client.acquire("tip")[1]["tools"]["tip"]["home_m"]
+            with client.pressing({"tip": [x, y, z + 1e-3]}):
+                client.force_when(lambda force: force["force_scale"] == [1.0], "the end of the soft start")
+            with client.pressing({"tip": [x + 3e-3, y, z - 3e-3]}):
+                client.force_when(lambda force: force["flags"][0] & Flags.IN_CONTACT, "contact")
+        stale = watcher.force_when(lambda force: force["flags"][0] & Flags.STALE, "silence")
+        assert stale["force_n"] == [[0.0, 0.0, 0.0]]
+        lifted = watcher.force_when(lambda force: not force["flags"][0] & CONTACT, "nothing touched")
+        assert lifted["n_contact_points"] == [0]
+        assert lifted["tissue_stored_j"] >= 0
+        forces = [np.array(message["force_n"][0]) for message in watcher.forces]
+    assert max(np.linalg.norm(b - a) for a, b in itertools.pairwise(forces)) < 0.5
