@@ -13,14 +13,15 @@ surface; outside, nothing is rendered. Nothing limits the forces, and the device
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from device_trace import Trace
-from palpate.model_file import ReducedModel
-from palpate_server.coupling.models import make_running
+from palpate_server.coupling.models import Model, make_running, tools_of
+from palpate_server.coupling.running import Tip
 from palpate_server.realtime import scheduler, shared_memory
 from palpate_server.realtime.native_image import make_image
 from palpate_server.realtime.safety import Limits
@@ -47,21 +48,24 @@ class Handle:
 
 
 def press(
-    model: ReducedModel,
+    model: Model,
     handle: Handle,
     reach_m: NDArray[np.float64],
     trace: Trace,
     max_damping_n_s_per_m: float,
+    tips: Sequence[Tip] | None = None,
 ) -> NDArray[np.float64]:
     """The handle's position at the n ticks of the device, m from the surface and inwards, and velocity, m/s; (n, 2).
 
-    reach_m (n,): where the hand would have the handle. max_damping_n_s_per_m: of passivity control, 0 for none. A handle
+    reach_m (n,): where the hand would have the handle. max_damping_n_s_per_m: of passivity control, 0 for none. tips: of a
+    surface model's tools, by default its file's. A handle
     that is a meter away is not followed further: the rest is infinite.
     """
-    inwards = -np.array(model.contacts[0].normal)
+    tools = tools_of(model)
+    inwards = -np.array(tools[0].normal)
     limits = Limits(1e6, 1e12, 1e6, 1e3, max_damping_n_s_per_m)
     memory = shared_memory.make_memory(
-        make_running(model), model.period_s, [limits] * len(model.contacts), 1.0
+        make_running(model, tips), model.period_s, [limits] * len(tools), 1.0
     )
     image = make_image(memory)
     incoming = memory.commands.incoming[0]

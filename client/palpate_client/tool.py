@@ -36,6 +36,7 @@ class Tool:
     normal: (3,) outward normal there, of length 1, in the client's frame.
     limits: the agreed limits by name; see "Limits" in docs/wire.md.
     warnings: the server's warnings, to be shown to the user.
+    touches_anywhere: whether the model is one whose surface can be touched everywhere, from outside.
     contract: checks every force, and counts.
     """
 
@@ -53,6 +54,7 @@ class Tool:
         self.frame = frame or Frame()
         self.normal = self.frame.direction_at_client(described.normal)
         self.home_m: Vector = described.start_m
+        self.touches_anywhere = connection.description.message["model"].get("kind") == "surface"
         self.limits: dict[str, float] = {}
         self.warnings: list[str] = []
         self.contract = Contract(connection.description)
@@ -200,7 +202,8 @@ def _vector(name: str, value: Sequence[float]) -> list[float]:
 class OneSidedContact:
     """Makes a contact with tissue one-sided: a device is pushed out of it, and never pulled in.
 
-    The body of a patch model follows the tip in every direction, also outwards. So while the hand is outside of the tissue,
+    The body of a patch model follows the tip in every direction, also outwards; that of a surface model does not, and gets the
+    hand's position as it is. For a patch model, while the hand is outside of the tissue,
     the tip is left at `home_m` and nothing is rendered. It enters where the hand enters. After a silence the tip stays out
     until the hand has left the tissue, so that no force comes back with a jump.
     """
@@ -213,6 +216,8 @@ class OneSidedContact:
 
     def tip(self, position_m: Sequence[float]) -> tuple[list[float], bool]:
         """The tip's position for the hand's position, m, in our frame; and whether the tip touches the tissue."""
+        if self._tool.touches_anywhere:
+            return list(position_m), True
         home, normal = self._tool.home_m, self._tool.normal
         depth = sum((h - p) * n for h, p, n in zip(home, position_m, normal, strict=True))
         silent = self._tool.silent_s > self._hold_s

@@ -16,7 +16,9 @@ class Hand:
     """A hand over a tool whose home is the client's origin and whose normal is z."""
 
     def __init__(self) -> None:
-        self.tool: Any = SimpleNamespace(home_m=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), silent_s=0.0)
+        self.tool: Any = SimpleNamespace(
+            home_m=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), silent_s=0.0, touches_anywhere=False
+        )
         self.contact = OneSidedContact(self.tool, HOLD_S)
 
     def at(self, z: float, x: float = 0.0, silent_s: float = 0.0) -> tuple[list[float], bool]:
@@ -54,3 +56,10 @@ def test_a_hand_that_came_in_during_a_silence_has_to_leave_first() -> None:
     hand.at(0.001, silent_s=HOLD_S * 2)
     assert not hand.at(-0.001, silent_s=HOLD_S * 2)[1]
     assert not hand.at(-0.001)[1]
+
+
+def test_a_surface_model_gets_the_hand_as_it_is_wherever_it_is() -> None:
+    hand = Hand()
+    hand.tool.touches_anywhere = True
+    for z in (0.01, -0.002):
+        assert hand.at(z, x=0.3) == ([0.3, 0.0, z], True)
