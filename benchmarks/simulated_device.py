@@ -64,9 +64,7 @@ def press(
     tools = tools_of(model)
     inwards = -np.array(tools[0].normal)
     limits = Limits(1e6, 1e12, 1e6, 1e3, max_damping_n_s_per_m)
-    memory = shared_memory.make_memory(
-        make_running(model, tips), model.period_s, [limits] * len(tools), 1.0
-    )
+    memory = shared_memory.make_memory(make_running(model, tips), model.period_s, [limits] * len(tools), 1.0)
     image = make_image(memory)
     incoming = memory.commands.incoming[0]
     propagators = handle.propagators(np.diff(trace.device_ns) * 1e-9).tolist()

@@ -66,7 +66,7 @@ def session(connection: Connection) -> dict[str, bytes]:
 
     def ask(action: str, title: str, **fields: Any) -> dict[str, Any]:
         requests[title] = pack({"kind": Kind.REQUEST, "schema_version": SCHEMA_VERSION, **fields})
-        answer = connection.ask(connection.keys.control(connection.name, action), fields)
+        answer = connection.ask(connection.keys.control(connection.name, action), fields, timeout_s=30.0)
         requests.setdefault(f"Answer to {action}", answer)
         return dict(msgpack.unpackb(answer))
 

@@ -137,7 +137,11 @@ AS_IT_IS = TipWanted()
 
 
 def tip_in(request: dict[str, Any]) -> TipWanted:
-    wanted = TipWanted(*(_optional_number(request, field) for field in TipWanted._fields))
+    wanted = TipWanted(
+        _optional_number(request, "radius_m"),
+        _optional_number(request, "friction"),
+        _optional_number(request, "stiffness_n_per_m"),
+    )
     for field in ("radius_m", "stiffness_n_per_m"):
         if getattr(wanted, field) == 0:
             raise Refused("out_of_range", f"{field} is 0: expected a number above 0")
