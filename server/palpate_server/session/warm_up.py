@@ -23,7 +23,7 @@ _NOTICE_AFTER_S = 2.0
 
 def warm_up(period_s: float, n_tools: int) -> None:
     """Call every compiled function once, on a model of its own; says so when that takes long."""
-    text = "compiling the real-time functions, once for this machine: about half a minute"
+    text = "compiling the real-time functions, once for this machine: about a minute"
     notice = threading.Timer(_NOTICE_AFTER_S, log.info, [text])
     notice.daemon = True
     notice.start()
