@@ -11,7 +11,7 @@ from numba import njit
 from numba.core.runtime import _nrt_python as nrt
 from numba.core.runtime.nrt import rtsys
 
-from palpate.model_file import ReducedModel
+from palpate.model_file import ReducedModel, SurfaceModel
 from palpate_client.wire import Flags
 from palpate_server.coupling import cross_fade, models
 from palpate_server.realtime import scheduler, shared_memory
@@ -27,6 +27,8 @@ LIMITS = Limits(
     workspace_radius_m=0.01,
     max_damping_n_s_per_m=4.0,
 )
+
+FREE = Limits(1e6, 1e12, 1e6, 1e6, 0.0)
 
 
 @njit()
@@ -45,6 +47,20 @@ def commanded_ticks(n: int, incoming: np.ndarray, image: Image, start_ns: int) -
         command = incoming[0]
         command.sequence = command.arrival_ns = now
         command.position_m[2] = depth
+        scheduler.hand_over(image, 1)
+        scheduler.repeat_tick(image, now, now, False)
+
+
+@njit()
+def pressing_ticks(n: int, incoming: np.ndarray, image: Image, start_ns: int) -> None:
+    """A new command before each tick: a sphere that comes from outside, slides, holds the tissue and lets it go."""
+    for k in range(n):
+        now = start_ns + k * PERIOD_NS
+        command = incoming[0]
+        command.sequence = command.arrival_ns = now
+        command.position_m[0] = 1e-5 * (k % 500)
+        command.position_m[2] = 1e-3 - 1e-5 * min(k % 500, 400)
+        command.attach = k % 500 > 450
         scheduler.hand_over(image, 1)
         scheduler.repeat_tick(image, now, now, False)
 
@@ -137,7 +153,7 @@ def test_no_tick_allocates_while_one_model_fades_into_another(
     ticks: Ticks, make_spring_mass_model: Callable[..., ReducedModel]
 ) -> None:
     assert ticks.allocations(commanded_ticks, 300) == 0
-    other = models.make_settled(make_spring_mass_model(2, 7), np.zeros((2, 3)))
+    other = models.make_running(make_spring_mass_model(2, 7))
     coupling = cross_fade.to_another(ticks.memory.coupling, other, 0.01)
     fading = shared_memory.with_coupling(ticks.memory, coupling)
     scheduler.exchange(ticks.image, make_image(fading))
@@ -145,6 +161,16 @@ def test_no_tick_allocates_while_one_model_fades_into_another(
     assert scheduler.is_changed(ticks.image)
     assert coupling.fade[0] == pytest.approx(0.5)
     assert np.any(coupling.following.patch.body.state)
+
+
+def test_no_tick_of_a_surface_model_allocates(make_surface_model: Callable[..., SurfaceModel]) -> None:
+    model = make_surface_model(2)
+    ticks = Ticks(shared_memory.make_memory(models.make_running(model), model.period_s, [FREE, FREE], 1 / 30))
+    assert ticks.allocations(pressing_ticks, 1500) == 0
+    for flag in (Flags.IN_CONTACT, Flags.SLIDING, Flags.ATTACHED):
+        assert ticks.seen(flag), flag
+    assert ticks.allocations(silent_ticks, 200) == 0
+    assert ticks.flags[-1] == Flags.STALE
 
 
 def test_a_tick_with_a_fault_does_not_allocate(ticks: Ticks) -> None:
