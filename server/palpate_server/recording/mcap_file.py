@@ -102,7 +102,10 @@ class Recording:
                 topic=key, message_encoding="json", schema_id=self._schemas[kind]
             )
         size = self._file.tell()
-        data = json.dumps(_plain(message), allow_nan=False).encode()
+        try:
+            data = json.dumps(message, allow_nan=False).encode()
+        except ValueError:  # not finite: rare, and to look at every number first takes half of the time
+            data = json.dumps(_plain(message), allow_nan=False).encode()
         self._writer.add_message(self._channels[key], log_time=time_ns, data=data, publish_time=time_ns)
         self._added += 1
         if self._file.tell() > size:  # a chunk was written, this message its last
