@@ -187,6 +187,7 @@ def test_the_headless_client_and_the_bridge_run_unchanged(
     assert (code, err) == (0, ""), err  # no warning either
 
 
+@pytest.mark.slow
 def test_models_of_both_kinds_are_loaded_in_turns_while_the_tool_presses_and_all_is_repeated(
     serve: Callable[..., Any],
     connect: Callable[..., Any],
