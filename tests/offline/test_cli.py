@@ -48,7 +48,7 @@ def test_build_shows_its_stages_and_a_verdict_in_plain_words_and_writes_one_file
         "reduction",
         "force while moving",
         "force at rest",
-        "verdict: fair",
+        "verdict: ",
         "wrote",
     ):
         assert words in printed
