@@ -33,11 +33,12 @@ def main() -> None:
     if not isinstance(model, SurfaceModel):
         sys.exit(f"{path}: expected a surface model, this is of kind {model.kind!r}")
     start, along, normal = frame(model)
-    time_s = np.arange(round(2.0 / model.period_s)) * model.period_s
+    time_s: Array = np.linspace(0.0, 2.0, round(2.0 / model.period_s), endpoint=False)
     positions, felt = touch(model, time_s, start, along, normal)
 
     figure = Figure(figsize=(13.5, 7.2), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=[1.0, 1.15])
+    halves: Any = figure.subfigures(1, 2, width_ratios=[1.0, 1.15])
+    left, right = halves
     draw_error_map(left, model, positions, normal)
     draw_touch(right, time_s, felt)
     figure.savefig(out, dpi=110)
