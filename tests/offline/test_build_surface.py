@@ -16,6 +16,7 @@ from palpate.model_file import SurfaceModel, load_model, save_model
 from palpate.report import accuracy_text
 from palpate.scene.material import PRESETS
 from palpate.scene.schema import check_config
+from palpate_server.simulation import Simulation
 
 SIDE_M, HEIGHT_M, RADIUS_M = 0.06, 0.04, 0.016
 
@@ -134,6 +135,35 @@ def test_the_model_is_judged_written_read_and_told(
     assert "never given out" in text
     assert not progress.warnings
     assert progress.stages[-3:] == ["modes", "residual flexibility", "evidence"]
+
+
+def test_a_tool_that_slides_over_an_edge_is_never_pulled_and_its_force_makes_no_jump(
+    built: tuple[SurfaceModel, _Progress],
+) -> None:
+    model, _ = built
+    simulation, depth, motion = Simulation(model), 2e-3, 7e-5
+    middle, touching = SIDE_M / 2, HEIGHT_M + RADIUS_M
+    down = [(middle, middle, z) for z in np.arange(touching + 5e-4, touching - depth, -motion)]
+    across = [(x, middle, touching - depth) for x in np.arange(middle, SIDE_M + 1.5 * RADIUS_M, motion)]
+    felt = [simulation.step({"tip": position})["tip"] for position in down + across]
+    force = np.array([one.force_n for one in felt])
+    assert min(one.force_n @ one.normal for one in felt) >= 0
+    assert np.linalg.norm(force[len(down)]) > 0.05  # N: it was in contact before the edge
+    assert felt[-1].n_points == 0 and not np.any(force[-1])
+    # Nothing is stiffer than the points of a whole contact in one tick; friction comes with the normal force.
+    largest = 2 * model.accuracy.largest_stiffness_n_per_m * motion
+    assert np.max(np.linalg.norm(np.diff(force, axis=0), axis=1)) < largest
+
+
+def test_a_tool_that_begins_inside_is_not_thrown_out_and_gets_no_energy(
+    built: tuple[SurfaceModel, _Progress],
+) -> None:
+    model, _ = built
+    simulation = Simulation(model)
+    for height in np.arange(-4e-3, 2e-3, 5e-5):
+        reaction = simulation.step({"tip": (SIDE_M / 2, SIDE_M / 2, HEIGHT_M + RADIUS_M + height)})["tip"]
+        assert np.linalg.norm(reaction.force_n) < 1e-3
+    assert reaction.work_j >= -1e-9 and reaction.n_points == 0
 
 
 def test_another_prony_series_changes_nothing_but_itself() -> None:
