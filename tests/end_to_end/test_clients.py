@@ -296,13 +296,15 @@ def test_a_client_whose_contact_is_released_by_another_fails_and_tells_the_serve
         name = holder_when_poking(observer)
         assert observer.query(f"control/{name}/release", RELEASE)[0]
         code, out, err = client.finish()
+        counted = observer.next_status()
     assert code == 1
     assert "we no longer hold the tool" in err
     summary = json.loads(out)
     assert len(summary["contract_broken"]) == 1
     assert summary["server_lost"] is None
-    assert summary["commands_unanswered"] > 0
-    assert summary["not_carried_out"].get("refused not_holder", 0) > 0
+    # None may be refused: a client that hears of its loss before the next command is due sends no more.
+    refused = summary["not_carried_out"].get("refused not_holder", 0)
+    assert refused <= counted["refused"]["not_holder"] <= summary["commands_unanswered"]
 
 
 def test_a_client_that_pauses_until_its_force_has_faded_goes_on_and_the_contract_holds(
