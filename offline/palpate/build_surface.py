@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -18,6 +17,7 @@ from palpate.factorization.dense import dense_memory
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.measures import enclosed_volume
 from palpate.geometry.node_surface import node_surface
+from palpate.memory import machine_memory
 from palpate.model_file import SurfaceAccuracy, SurfaceModel
 from palpate.modes.body_modes import factor_memory, stiffness_memory
 from palpate.modes.held_body import HeldBody, hold
@@ -194,7 +194,7 @@ def _require_memory(cloud: NodeCloud, n_modes: int, support_radius_factor: float
         + stiffness
         + max(4 * stiffness, factor + max(space, residual_memory(n, n_points, n_modes)))
     )
-    present = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    present = machine_memory()
     if needed > present:
         raise MemoryError(
             f"the surface model of {cloud.n_nodes:,} nodes, {n_points:,} of them on the surface, needs about "

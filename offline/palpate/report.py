@@ -20,11 +20,7 @@ def accuracy_text(model: ReducedModel | SurfaceModel, verbose: bool = False) -> 
     lines += _columns(_first_screen(model))
     lines.append(f"  verdict: {_verdict(model)}")
     lines += [f"  - {text}" for text in advice(model)]
-    if verbose:
-        lines += ["", "every figure (docs/model-file.md defines them):", *_columns(_figures(model))]
-    else:
-        lines.append("  (--verbose shows every figure)")
-    return "\n".join(lines)
+    return "\n".join(lines + _details(_figures(model), verbose))
 
 
 def advice(model: ReducedModel) -> list[str]:
@@ -136,19 +132,15 @@ def _surface_text(model: SurfaceModel, verbose: bool) -> str:
         *_columns(rows),
         f"  verdict: {_surface_verdict(model)}",
     ]
-    if verbose:
-        figures = [
-            ("nodes", f"{model.n_nodes:,}", ""),
-            ("points", f"{model.n_points:,}", f"{model.n_points - n_free:,} of them held"),
-            ("triangles", f"{len(model.triangles):,}", ""),
-            ("highest mode", f"{np.sqrt(model.squared_frequencies[-1]) / (2 * np.pi):.3g} Hz", ""),
-            ("contact radius", f"{1e3 * accuracy.contact_radius_m:.3g} mm", "of the smallest tool, where errors are stated"),
-            ("shift of the residual", f"{accuracy.residual_shift_m_per_n:.2g} m/N", "makes it definite in spite of rounding"),
-        ]  # fmt: skip
-        lines += ["", "every figure (docs/model-file.md defines them):", *_columns(figures)]
-    else:
-        lines.append("  (--verbose shows every figure)")
-    return "\n".join(lines)
+    figures = [
+        ("nodes", f"{model.n_nodes:,}", ""),
+        ("points", f"{model.n_points:,}", f"{model.n_points - n_free:,} of them held"),
+        ("triangles", f"{len(model.triangles):,}", ""),
+        ("highest mode", f"{np.sqrt(model.squared_frequencies[-1]) / (2 * np.pi):.3g} Hz", ""),
+        ("contact radius", f"{1e3 * accuracy.contact_radius_m:.3g} mm", "of the smallest tool, where errors are stated"),
+        ("shift of the residual", f"{accuracy.residual_shift_m_per_n:.2g} m/N", "makes it definite in spite of rounding"),
+    ]  # fmt: skip
+    return "\n".join(lines + _details(figures, verbose))
 
 
 def _surface_verdict(model: SurfaceModel) -> str:
@@ -161,6 +153,12 @@ def _surface_verdict(model: SurfaceModel) -> str:
     if worst > GOOD_ERROR:
         return f"fair: a trained hand may feel the error{mesh}"
     return f"good: the error is below what a hand tells apart{mesh}"
+
+
+def _details(figures: Rows, verbose: bool) -> list[str]:
+    if verbose:
+        return ["", "every figure (docs/model-file.md defines them):", *_columns(figures)]
+    return ["  (--verbose shows every figure)"]
 
 
 def _columns(rows: Rows) -> list[str]:

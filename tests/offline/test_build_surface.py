@@ -194,7 +194,7 @@ def test_modes_that_end_within_the_band_are_refused() -> None:
 
 def test_a_body_that_does_not_fit_is_refused_before_it_is_assembled(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**16}  # 256 MiB
-    monkeypatch.setattr("palpate.build_surface.os.sysconf", sizes.__getitem__)
+    monkeypatch.setattr("palpate.memory.os.sysconf", sizes.__getitem__)
     progress = _Progress()
     with pytest.raises(
         MemoryError,

@@ -18,8 +18,6 @@ Integers = NDArray[np.int64]
 Records = NDArray[np.void]
 Record = Any  # one element of a structured array
 
-LIFTED, TOUCHING, GRABBING = range(3)  # what is wanted of a tool in a tick
-
 _REST_FORCE_N = 1e-9
 _REST_ENERGY_J = 1e-15
 _IN_CONTACT = int(Flags.IN_CONTACT)

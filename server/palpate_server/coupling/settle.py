@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_server.coupling import running as models
-from palpate_server.coupling.running import LIFTED, Running
+from palpate_server.coupling.running import Running
+from palpate_server.coupling.sphere_contact import LIFTED
 from palpate_server.realtime import native_image
 from palpate_server.realtime.compiled import compiled
 from palpate_server.realtime.native_image import Image, make_image, view
