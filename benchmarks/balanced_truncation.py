@@ -42,7 +42,7 @@ def cube(counts: tuple[int, int, int]) -> dict[str, Array]:
     from palpate.discretization.supports import components
     from palpate.geometry.shapes import box_lattice
     from palpate.modes.dense import elastic_modes
-    from palpate.scene.material import PRESETS
+    from palpate.scene.tissues import PRESETS
 
     material = PRESETS["paper-cube"]
     cloud = box_lattice((0, 0, 0), (1, 1, 1), counts)

@@ -28,6 +28,7 @@ COMMANDS = {
     "demo": Command(_BUILD, "build the liver, serve it, poke it, and draw what was felt", "all", "palpate.commands", "demo"),
     "build": Command(_BUILD, "build a scene into a model file, and say how accurate it is", "build", "palpate.commands", "build"),
     "fit": Command(_BUILD, "fit the material of a scene to measured records of a tissue", "build", "palpate.commands", "fit"),
+    "tissues": Command(_BUILD, "list the tissues that a scene can name, with their sources", "build", "palpate.commands", "tissues"),
     "bank": Command(_BUILD, "build several scenes, what they share once; on many machines by Dask", "build", "palpate.commands", "bank"),
     "inspect": Command(_BUILD, "say what a model file holds and how accurate it is", "server", "palpate.commands", "inspect"),
     "surface": Command(_BUILD, "take the surface of a label of an image, smooth and closed, in m", "images", "palpate.commands", "surface"),

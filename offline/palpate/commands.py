@@ -249,6 +249,27 @@ def fit() -> None:
         print(tissue_text(tissue), "", material_toml(tissue), sep="\n")
 
 
+def tissues() -> None:
+    """List the tissues that a scene's `preset` may name, with what was measured of each and how much it varies."""
+    parser = argparse.ArgumentParser(description=tissues.__doc__)
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help="all that is known of these (default: a table)"
+    )
+    parser.add_argument("--json", action="store_true", help="a list with all figures")
+    options = parser.parse_args()
+    from palpate.scene.tissues import TISSUES, tissue_json, tissue_text, tissues_text
+
+    for name in options.names:
+        if name not in TISSUES:
+            raise ValueError(f"there is no tissue '{name}': expected one of {', '.join(TISSUES)}")
+    if options.json:
+        print(json.dumps([tissue_json(name) for name in options.names or TISSUES], indent=2))
+    elif options.names:
+        print(*(tissue_text(name) for name in options.names), sep="\n\n")
+    else:
+        print(tissues_text())
+
+
 def positive(text: str) -> float:
     """A finite number above zero. Raises argparse.ArgumentTypeError."""
     try:

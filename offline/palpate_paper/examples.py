@@ -16,7 +16,8 @@ from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.modes.dense import elastic_modes
 from palpate.modes.elastic_modes import ElasticModes
-from palpate.scene.material import PRESETS, PronySeries
+from palpate.scene.material import PronySeries
+from palpate.scene.tissues import PRESETS
 from palpate_paper import membrane
 from palpate_paper.membranes import Membrane, disc_membrane, square_membrane
 from palpate_paper.time_integration import EquationsOfMotion, equations_of_motion

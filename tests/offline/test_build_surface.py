@@ -14,8 +14,8 @@ from skfem.helpers import ddot, eye, sym_grad, trace
 from palpate.build_surface import build_surface_model
 from palpate.model_file import SurfaceModel, load_model, save_model
 from palpate.report import accuracy_text
-from palpate.scene.material import PRESETS
 from palpate.scene.schema import check_config
+from palpate.scene.tissues import PRESETS
 from palpate_server.simulation import Simulation
 
 SIDE_M, HEIGHT_M, RADIUS_M = 0.06, 0.04, 0.016

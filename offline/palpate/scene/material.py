@@ -59,6 +59,11 @@ class PronySeries:
             h += gamma * s * tau / (1 + s * tau)
         return h
 
+    def loss_tangent(self, frequency_hz: float) -> float:
+        """Loss modulus over storage modulus."""
+        h = self.transfer_factor(np.array(2j * np.pi * frequency_hz))
+        return float(h.imag / h.real)
+
 
 @dataclass(frozen=True)
 class Material:
@@ -97,14 +102,3 @@ def check_constant(name: str, value: float) -> None:
     if not low <= value <= high:
         hint = " (45 % is 0.45)" if name == "poissons_ratio" else ""
         raise ValueError(f"{name} = {value}: expected from {low:g} to {high:g}{hint}")
-
-
-PRESETS: dict[str, Material] = {
-    # BaniHani & De 2009, section 4.2: rho = 10, gamma_1 = 1, tau_1 = 1 s. E and nu are not stated there: 1 and 0.3 are ours.
-    "paper-cube": Material(1.0, 0.3, 10.0, PronySeries((1.0,), (1.0,))),
-    # Liver: G = 1.8 +- 0.4 kPa and rho = 1060 kg/m3, PMC6925591 Table 1, so E = 3 G = 5.4 kPa as for nu = 0.5.
-    # gamma 0.5 and tau 0.58 s as in the viscoelastic TLED example of the SOFA framework.
-    # The second branch (0.3 at 4 ms) stands for the short-time branches of real tissue: without one a mode above
-    # 1/tau keeps ringing, decaying at only gamma / (2 (1 + gamma) tau). It is our choice, not a measurement.
-    "liver": Material(5400.0, 0.45, 1060.0, PronySeries((0.5, 0.3), (0.58, 0.004))),
-}

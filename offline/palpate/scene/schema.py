@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from palpate.model_file import LONGEST_PERIOD_S, SHORTEST_PERIOD_S
-from palpate.scene.material import PRESETS, Material, PronySeries, check_constant
+from palpate.scene.material import Material, PronySeries, check_constant
 from palpate.scene.quantities import (
     SHORTEST_M,
     Count,
@@ -23,6 +23,7 @@ from palpate.scene.quantities import (
     Table,
 )
 from palpate.scene.regions import AreaRegion, Region
+from palpate.scene.tissues import PRESETS
 
 _SHORTEST_TAU_IN_PERIODS = 0.01
 """A faster branch acts as a damper, and its terms are lost in round-off."""

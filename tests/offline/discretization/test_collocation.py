@@ -6,7 +6,8 @@ import pytest
 from palpate.discretization import collocation
 from palpate.geometry.shapes import ball, box_lattice
 from palpate.modes.dense import elastic_modes, nodal_stiffness
-from palpate.scene.material import PRESETS, PronySeries
+from palpate.scene.material import PronySeries
+from palpate.scene.tissues import PRESETS
 from palpate_paper.stability import stability
 
 EPS = np.finfo(float).eps

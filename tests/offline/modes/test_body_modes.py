@@ -8,7 +8,7 @@ from palpate.lti.frequencies import relative_errors
 from palpate.lti.viscoelastic import viscoelastic_system
 from palpate.modes.body_modes import TOLERANCE, by_ritz, ritz_body_modes
 from palpate.modes.dense import elastic_modes
-from palpate.scene.material import PRESETS
+from palpate.scene.tissues import PRESETS
 
 LIVER = PRESETS["liver"]
 

@@ -13,7 +13,7 @@ from palpate.modes.compliance import static_compliance
 from palpate.modes.dense import elastic_modes, nodal_stiffness
 from palpate.modes.held_body import hold
 from palpate.modes.lanczos import lowest_modes
-from palpate.scene.material import PRESETS
+from palpate.scene.tissues import PRESETS
 
 EPS = np.finfo(float).eps
 

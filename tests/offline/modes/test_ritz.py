@@ -13,7 +13,8 @@ from palpate.modes.dense import elastic_modes, nodal_stiffness
 from palpate.modes.held_body import hold
 from palpate.modes.krylov import KrylovSpace
 from palpate.modes.ritz import ritz_modes
-from palpate.scene.material import PRESETS, Material
+from palpate.scene.material import Material
+from palpate.scene.tissues import PRESETS
 
 EPS = np.finfo(float).eps
 LIVER = PRESETS["liver"]

@@ -16,8 +16,8 @@ from palpate.reduction import reduce
 from palpate.reduction.accuracy import hinf_error, in_band_error
 from palpate.reduction.balancing import balance
 from palpate.reduction.gramians import gramians, real_form
-from palpate.scene.material import PRESETS
 from palpate.scene.schema import check_config, load_config
+from palpate.scene.tissues import PRESETS
 
 
 def cube(n, discretization):

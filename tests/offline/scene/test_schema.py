@@ -112,7 +112,7 @@ def test_every_shipped_scene_is_valid(scene: Path) -> None:
         ),
         ("reduction", {"tolerance": 2.0}, ["reduction.tolerance = 2.0", "below 1", "2 % is 0.02"]),
         ("material.density_kg_per_m3", None, ["material", "density_kg_per_m3 missing", "preset"]),
-        ("material.preset", "kidney", ["preset", "'kidney'", "liver"]),
+        ("material.preset", "spleen", ["preset", "'spleen'", "liver"]),
         ("material.gamma", [0.5, 0.2], ["material", "gamma has 2", "tau_s has 1"]),
         ("material.tau_s", None, ["material", "gamma and tau_s"]),
         ("fixed", [], ["fixed", "at least 1"]),

@@ -19,7 +19,7 @@ from palpate.modes.dense import elastic_modes
 from palpate.modes.held_body import HeldBody, hold
 from palpate.modes.lanczos import LowestModes, lowest_modes
 from palpate.progress import NO_PROGRESS
-from palpate.scene.material import PRESETS
+from palpate.scene.tissues import PRESETS
 from palpate.surface_model import evidence
 from palpate.surface_model.footprint import footprints, on_components
 from palpate.surface_model.mode_count import enough_modes, guessed_modes, sample_footprints
