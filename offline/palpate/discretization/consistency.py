@@ -75,7 +75,7 @@ def consistent_gradient(
     )
     pinned = np.zeros(n)
     pinned[_far_apart(nodes)] = 1
-    factor = factorize(csr_array(normal + diags_array(pinned)))
+    factor = factorize(csr_array(normal + diags_array(pinned)), points=nodes)
 
     corrected = list(h.gradient)
     for _ in range(2):  # the second time for the round-off of the first, which grows with the cloud's grading

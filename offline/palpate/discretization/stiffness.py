@@ -31,6 +31,8 @@ def isotropic_stiffness(
     indptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     indices, blocks = np.empty(indptr[-1], np.int32), np.empty((indptr[-1], 3, 3))
     _fill(rows, columns, gradients, volumes, lame_pa, shear_modulus_pa, indptr, indices, blocks)
+    if 9 * indptr[-1] <= np.iinfo(np.int32).max:  # indices of 8 bytes are a third of the matrix
+        indptr = indptr.astype(np.int32)
     size = 3 * pattern.shape[1]
     return csr_array(bsr_array((blocks, indices, indptr), shape=(size, size)).tocsr())
 

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 class DenseCholesky:
-    """The factor of a positive definite matrix given by its upper triangle. Raises LinAlgError where it is not definite.
+    """The factor of a symmetric positive definite matrix. Raises LinAlgError where it is not definite.
 
     nnz         entries of the factor
     n_negative  negative eigenvalues of the matrix: none
@@ -20,10 +20,10 @@ class DenseCholesky:
 
     n_negative = 0
 
-    def __init__(self, upper: csr_array) -> None:
-        n = upper.shape[0]
+    def __init__(self, matrix: csr_array) -> None:
+        n = matrix.shape[0]
         self.nnz = n * (n + 1) // 2
-        self._factor = cholesky(upper.toarray(order="F"), overwrite_a=True, check_finite=False)
+        self._factor = cholesky(matrix.toarray(order="F"), overwrite_a=True, check_finite=False)
 
     def solve(self, right: Array) -> Array:
         """(n, k) for right-hand sides (n, k)."""

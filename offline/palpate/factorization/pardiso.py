@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import weakref
+from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import bsr_array, csr_array
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int32]
@@ -38,6 +39,37 @@ def library() -> ctypes.CDLL | None:
     return None
 
 
+@dataclass(frozen=True)
+class UpperTriangle:
+    """Of a symmetric matrix, by blocks: those at the diagonal and above are stored whole.
+
+    values (n_blocks, block, block), starts (n_rows + 1,), columns (n_blocks,): rows and columns of blocks
+    """
+
+    values: Array
+    starts: Integers
+    columns: Integers
+
+    @property
+    def block(self) -> int:
+        return self.values.shape[1]
+
+
+def upper_triangle(matrix: csr_array, block: int) -> UpperTriangle:
+    """With blocks (block, block); entries of the blocks that are not stored are zeros."""
+    n_rows = matrix.shape[0] // block
+    # scipy's `triu` makes three copies of the matrix on the way.
+    rows = np.repeat(np.arange(n_rows, dtype=np.int32), np.diff(matrix.indptr[::block]))
+    kept = matrix.indices // block >= rows
+    starts = np.concatenate([[0], np.cumsum(kept)])[matrix.indptr].astype(np.int32)
+    upper = csr_array((matrix.data[kept], matrix.indices[kept], starts), shape=matrix.shape)
+    upper.sort_indices()
+    blocks = bsr_array(upper, blocksize=(block, block))
+    return UpperTriangle(
+        blocks.data, blocks.indptr.astype(np.int32, copy=False), blocks.indices.astype(np.int32, copy=False)
+    )
+
+
 class Pardiso:
     """The factor of a symmetric matrix given by its upper triangle.
 
@@ -45,15 +77,11 @@ class Pardiso:
     n_negative  negative eigenvalues of the matrix: its inertia
     """
 
-    def __init__(self, upper: csr_array, definite: bool) -> None:
-        n = upper.shape[0]
+    def __init__(self, upper: UpperTriangle, definite: bool) -> None:
+        n = len(upper.starts) - 1
         self._handle = (ctypes.c_void_p * 64)()
         self._type = _POSITIVE_DEFINITE if definite else _INDEFINITE
-        self._matrix = (
-            np.ascontiguousarray(upper.data, dtype=np.float64),
-            upper.indptr.astype(np.int32, copy=False),
-            upper.indices.astype(np.int32, copy=False),
-        )
+        self._matrix = upper
         parameters = np.zeros(64, np.int32)
         parameters[0] = 1  # no defaults
         parameters[1] = 2  # nested dissection (METIS)
@@ -61,17 +89,19 @@ class Pardiso:
         parameters[17] = -1  # report the entries of the factor
         parameters[20] = 1  # pivots of one and two
         parameters[34] = 1  # indices from 0
+        parameters[36] = upper.block if upper.block > 1 else 0  # blocks, else compressed rows
         self._parameters = parameters
         weakref.finalize(self, _release, self._handle, self._type, n, parameters)
         _call(self._handle, self._type, _ANALYZE_AND_FACTORIZE, n, self._matrix, parameters, None, None)
-        self.nnz = int(parameters[17])
+        self.nnz = int(parameters[17]) * upper.block**2
         self.n_negative = 0 if definite else int(parameters[22])
 
     def solve(self, right: Array) -> Array:
         """(n, k) for right-hand sides (n, k)."""
         right = np.array(right, dtype=np.float64, order="F")
         solution = np.empty_like(right, order="F")
-        _call(self._handle, self._type, _SOLVE, len(right), self._matrix, self._parameters, right, solution)
+        n = len(self._matrix.starts) - 1
+        _call(self._handle, self._type, _SOLVE, n, self._matrix, self._parameters, right, solution)
         return solution
 
 
@@ -84,7 +114,7 @@ def _call(
     kind: int,
     phase: int,
     n: int,
-    matrix: tuple[Array, Integers, Integers] | None,
+    matrix: UpperTriangle | None,
     parameters: Integers,
     right: Array | None,
     solution: Array | None,
@@ -93,7 +123,8 @@ def _call(
     mkl = library()
     assert mkl is not None
     error = ctypes.c_int(0)
-    values, starts, columns = (a.ctypes.data_as(ctypes.c_void_p) for a in matrix) if matrix else (None,) * 3
+    arrays = (matrix.values, matrix.starts, matrix.columns) if matrix else ()
+    values, starts, columns = (a.ctypes.data_as(ctypes.c_void_p) for a in arrays) if matrix else (None,) * 3
     mkl.pardiso(
         handle,
         _integer(1),

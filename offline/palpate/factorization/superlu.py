@@ -6,20 +6,20 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array, triu
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 Array = NDArray[np.float64]
 
 
 class SuperLU:
-    """The factor of a symmetric matrix given by its upper triangle, with the pivots on the diagonal.
+    """The factor of a symmetric matrix, with the pivots on the diagonal.
 
     nnz  entries of L and U
     """
 
-    def __init__(self, upper: csr_array) -> None:
-        full = csc_array(upper + triu(upper, 1).T)
+    def __init__(self, matrix: csr_array) -> None:
+        full = csc_array((matrix.data, matrix.indices, matrix.indptr), shape=matrix.shape)  # symmetric
         try:
             self._lu = splu(
                 full,

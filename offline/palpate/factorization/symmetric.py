@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 
 from palpate.factorization import pardiso
 from palpate.factorization.dense import DenseCholesky
+from palpate.factorization.multifrontal import MultifrontalCholesky
 from palpate.factorization.superlu import SuperLU
 
 Array = NDArray[np.float64]
@@ -38,18 +39,18 @@ class _Backend(Protocol):
 
 
 class SymmetricFactor:
-    """A factorized symmetric matrix A.
+    """A factorized symmetric matrix A, the sum of `terms`, which are kept to check solutions.
 
     solver  name of the direct solver
     nnz     entries of the factor
     """
 
-    def __init__(self, upper: csr_array, backend: _Backend, solver: str) -> None:
+    def __init__(self, terms: tuple[csr_array, ...], norm: float, backend: _Backend, solver: str) -> None:
         self.solver = solver
         self.nnz = backend.nnz
         self._backend = backend
-        self._upper = upper
-        self._norm = float(np.max(_times(abs(upper), np.ones(upper.shape[0]))))
+        self._terms = terms
+        self._norm = norm
 
     @property
     def n_negative(self) -> int | None:
@@ -69,7 +70,7 @@ class SymmetricFactor:
         for _ in range(_MOST_REFINEMENTS):
             if error <= _REFINED_ABOVE:
                 break
-            refined = solution + self._backend.solve(columns - _times(self._upper, solution))
+            refined = solution + self._backend.solve(columns - self._times(solution))
             refined_error = self._backward_error(columns @ weights, refined @ weights)
             if not refined_error < error:
                 break
@@ -82,52 +83,59 @@ class SymmetricFactor:
         return solution.reshape(right.shape)
 
     def _backward_error(self, right: Array, solution: Array) -> float:
-        residual = np.abs(right - _times(self._upper, solution)).sum()
+        residual = np.abs(right - self._times(solution)).sum()
         scale = self._norm * np.abs(solution).sum() + np.abs(right).sum()
         return float(residual / scale) if scale > 0 else 0.0
 
+    def _times(self, x: Array) -> Array:
+        return sum((term @ x for term in self._terms[1:]), start=self._terms[0] @ x)
+
 
 def solver_name(n_rows: int = 0, n_solves: int = 0) -> str:
-    """The direct solver that `factorize` uses on this machine for a definite matrix."""
+    """The direct solver that `factorize` uses on this machine for a definite matrix of nodes with places."""
     if pardiso.library() is not None:
         return "MKL PARDISO"
-    return "LAPACK" if n_solves >= MANY and n_rows <= DENSE_UP_TO else "SuperLU"
+    return "LAPACK" if n_solves >= MANY and n_rows <= DENSE_UP_TO else "multifrontal Cholesky"
 
 
-def factorize(matrix: csr_array, *, definite: bool = True, n_solves: int = 0) -> SymmetricFactor:
-    """The factor of a symmetric matrix (n, n), whose upper triangle is read: by MKL PARDISO where the package `mkl` is
-    installed, else by SuperLU, or by LAPACK as a dense one where that is definite and not large, and many solutions follow.
+def factorize(
+    *terms: csr_array, definite: bool = True, points: Array | None = None, n_solves: int = 0
+) -> SymmetricFactor:
+    """The factor of a symmetric matrix (n, n), the sum of `terms`: by MKL PARDISO where the package `mkl` is installed. Else a
+    definite one of nodes with places by `MultifrontalCholesky`, or by LAPACK as a dense one where it is not large, and many
+    solutions follow; any other by SuperLU.
 
+    terms     symmetric, with both triangles. Their sum does not outlive the factorization: a large matrix and a small change
+              of it take the memory of one
     definite  whether all eigenvalues are expected to be positive
+    points    (n_nodes, dim), m: places of the nodes, near ones of which are coupled, where the matrix consists of dense
+              blocks for n / n_nodes unknowns of each node in sequence
     n_solves  about how many right-hand sides will come
 
-    Raises LinAlgError where a matrix that is said to be definite is not, by MKL PARDISO and LAPACK (SuperLU factorizes it,
-    and n_negative tells), or where one is singular; MemoryError where the factor does not fit.
+    Raises LinAlgError where a matrix that is said to be definite is not (SuperLU factorizes it, and n_negative tells), or
+    where one is singular; MemoryError where the factor does not fit.
     """
-    upper = _upper_triangle(matrix)
-    name = solver_name(matrix.shape[0], n_solves if definite else 0)
+    name = solver_name(terms[0].shape[0], n_solves)
+    norm = sum(_norm(term) for term in terms)
     backend: _Backend
-    match name:
-        case "MKL PARDISO":
-            backend = pardiso.Pardiso(upper, definite)
-        case "LAPACK":
-            backend = DenseCholesky(upper)
-        case _:
-            backend = SuperLU(upper)
-    return SymmetricFactor(upper, backend, name)
+    if name == "MKL PARDISO":
+        block = terms[0].shape[0] // len(points) if definite and points is not None else 1
+        backend = pardiso.Pardiso(pardiso.upper_triangle(_sum(terms), block), definite)
+    elif name == "LAPACK" and definite:
+        backend = DenseCholesky(_sum(terms))
+    elif definite and points is not None:
+        backend = MultifrontalCholesky(terms, points)
+    else:
+        name, backend = "SuperLU", SuperLU(_sum(terms))
+    return SymmetricFactor(terms, norm, backend, name)
 
 
-def _upper_triangle(matrix: csr_array) -> csr_array:
-    """The upper triangle with sorted indices; scipy's `triu` makes three copies of the matrix on the way."""
-    rows = np.repeat(np.arange(matrix.shape[0], dtype=np.int32), np.diff(matrix.indptr))
-    kept = matrix.indices >= rows
-    counts = np.bincount(rows[kept], minlength=matrix.shape[0])
-    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-    upper = csr_array((matrix.data[kept], matrix.indices[kept], starts), shape=matrix.shape)
-    upper.sort_indices()
-    return upper
+def _sum(terms: tuple[csr_array, ...]) -> csr_array:
+    return sum(terms[1:], start=terms[0])
 
 
-def _times(upper: csr_array, x: Array) -> Array:
-    """A x for a symmetric A given by its upper triangle; x (n,) or (n, k)."""
-    return upper @ x + upper.T @ x - (upper.diagonal() * x.T).T
+def _norm(matrix: csr_array) -> float:
+    """The largest sum of absolute values in a row."""
+    ones = np.ones(matrix.shape[0])
+    absolute = csr_array((np.abs(matrix.data), matrix.indices, matrix.indptr), shape=matrix.shape)
+    return float(np.max(absolute @ ones))

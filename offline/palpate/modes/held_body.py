@@ -47,7 +47,7 @@ class Constraints:
         """Raises LinAlgError where the shape functions of two of the nodes are the same."""
         rows = body.basis.value[nodes]
         matrix = csr_array(kron(rows, eye_array(body.n_components), format="csr"))
-        return cls(nodes, matrix, factorize(csr_array(rows @ rows.T)))
+        return cls(nodes, matrix, factorize(csr_array(rows @ rows.T), points=body.basis.points[nodes]))
 
     def project(self, parameters: Array) -> Array:
         """P U: the parameters (c n_nodes, k) nearest to the given ones that hold the nodes; also P f of loads."""
@@ -115,17 +115,13 @@ def hold(body: AssembledBody, nodes: Indices, n_solves: int = 0) -> HeldBody:
     """
     if not body.symmetric:
         raise ValueError("the body is not symmetric: expected one of the conservative discretization")
-    return HeldBody(
-        body, Constraints.of(body, nodes), factorize(penalized(body, nodes, 0.0), n_solves=n_solves)
-    )
+    factor = factorize(body.stiffness, penalty(body, nodes), points=body.basis.points, n_solves=n_solves)
+    return HeldBody(body, Constraints.of(body, nodes), factor)
 
 
-def penalized(body: AssembledBody, nodes: Indices, shift: float) -> csr_array:
-    """(c n_nodes, c n_nodes): K + shift M + Cᵀ W C, with the sparsity of K."""
-    c, value = body.n_components, body.basis.value
+def penalty(body: AssembledBody, nodes: Indices) -> csr_array:
+    """(c n_nodes, c n_nodes): Cᵀ W C, which is added to K; its entries are among those of K."""
+    c, rows = body.n_components, body.basis.value[nodes]
     strongest = body.stiffness.diagonal().reshape(-1, c).max(axis=1)
-    weight = np.zeros(body.n_nodes)
-    weight[nodes] = PENALTY * strongest[nodes]
-    weight += shift * body.mass
-    added = value.T @ (diags_array(weight) @ value)
-    return csr_array(body.stiffness + kron(added, eye_array(c), format="csr"))
+    weights = diags_array(PENALTY * strongest[nodes])
+    return csr_array(kron(rows.T @ (weights @ rows), eye_array(c), format="csr"))

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
+from scipy.sparse import diags_array, eye_array, kron
 
 from palpate.factorization import factorize
-from palpate.modes.held_body import HeldBody, penalized
+from palpate.modes.held_body import HeldBody, penalty
 from palpate.modes.krylov import KrylovSpace
 
 Array = NDArray[np.float64]
@@ -92,7 +93,9 @@ def _require_none_missed(held: HeldBody, mu: Array, n_modes: int) -> None:
     """Raises LinAlgError unless K - s M, s in the widest gap above the wanted modes, has the right inertia."""
     gap = n_modes - 1 + int(np.argmax(np.diff(mu[n_modes - 1 :]) / mu[n_modes - 1 : -1]))
     shift = float((mu[gap] + mu[gap + 1]) / 2)
-    factor = factorize(penalized(held.body, held.nodes, -shift), definite=False)
+    body, value = held.body, held.body.basis.value
+    mass = kron(value.T @ (diags_array(body.mass) @ value), eye_array(body.n_components), format="csr")
+    factor = factorize(body.stiffness, penalty(body, held.nodes), -shift * mass, definite=False)
     if factor.n_negative is None:
         raise np.linalg.LinAlgError(
             f"{factor.solver} can't tell how many modes lie below {shift:.6g} (rad/s)²"
