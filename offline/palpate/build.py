@@ -16,6 +16,7 @@ from palpate.expected import expected_size, require_memory
 from palpate.factorization import solver_name
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.regions import ContactPatch
+from palpate.inclusions import with_inclusions
 from palpate.lti.block_form import to_block_form
 from palpate.lti.errors import ReductionError
 from palpate.lti.pole_residue import PoleResidueSystem
@@ -134,6 +135,7 @@ def build_full_model(
     cloud, warnings = cache.kept("cloud", keys.cloud, lambda: _cloud(config, folder))
     for text in (*warnings, *plausibility(config, float(np.max(np.ptp(cloud.points, axis=0))))):
         progress.warn(text)
+    cloud = with_inclusions(config, folder, cloud, progress.warn)
     fixed = fixed_nodes(config, cloud)
     patches = contact_patches(config, cloud, fixed)
     progress.note(

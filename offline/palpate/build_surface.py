@@ -17,6 +17,7 @@ from palpate.factorization.dense import dense_memory
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.measures import enclosed_volume
 from palpate.geometry.node_surface import node_surface
+from palpate.inclusions import with_inclusions
 from palpate.memory import machine_memory
 from palpate.model_file import SurfaceAccuracy, SurfaceModel
 from palpate.modes.body_modes import factor_memory, stiffness_memory
@@ -75,7 +76,7 @@ def build_surface_model(config: Config, folder: Path, progress: Progress = NO_PR
     """
     digest, material = fingerprint(config, folder), config.material.material()
     progress("node cloud")
-    cloud = build_cloud(config, folder, progress)
+    cloud = with_inclusions(config, folder, build_cloud(config, folder, progress), progress.warn)
     for text in plausibility(config, float(np.max(np.ptp(cloud.points, axis=0)))):
         progress.warn(text)
     tools, fixed = tool_shapes(config, cloud), fixed_nodes(config, cloud)

@@ -12,6 +12,7 @@ from palpate.factorization import solver_name
 from palpate.geometry.measures import enclosed_volume, triangle_normals
 from palpate.geometry.spacing import Refinement
 from palpate.geometry.surface import load_surface
+from palpate.inclusions import finer_around_inclusions
 from palpate.memory import machine_memory
 from palpate.modes.body_modes import STEPS_EXPECTED, by_ritz, factor_memory, stiffness_memory
 from palpate.modes.dense import dense_memory
@@ -62,7 +63,8 @@ def expected_size(config: Config, folder: Path) -> BodySize:
 def _nodes_inside(config: Config, geometry: SurfaceGeometry, folder: Path) -> float:
     """The integral of one node per spacing³ over the body, and of half a node per spacing² over its surface.
 
-    The spacing grows away from a refined contact, about which the body is taken for a half-space.
+    The spacing grows away from a refined contact, about which the body is taken for a half-space, and on both sides of the
+    surface of a refined inclusion, which is taken to be flat.
     """
     surface = load_surface(folder / geometry.file, geometry.file_unit).surface
     h = geometry.spacing_m
@@ -76,6 +78,9 @@ def _nodes_inside(config: Config, geometry: SurfaceGeometry, folder: Path) -> fl
 
         if reach > 0:
             nodes += quad(more, 0, reach, points=[patch.radius_m])[0]
+    for part in finer_around_inclusions(config, folder):
+        finest, growth = part.spacing_m, part.growth
+        nodes += 2 * part.area_m2 * ((finest**-2 - h**-2) / 2 - (h - finest) / h**3) / growth
     return nodes
 
 

@@ -15,6 +15,7 @@ from palpate.geometry.sampling import depth_inside, sample_elements
 from palpate.geometry.shapes import ball, box_lattice
 from palpate.geometry.spacing import RefinedArea, Refinement, SpacingField
 from palpate.geometry.surface import load_surface
+from palpate.inclusions import finer_around_inclusions
 from palpate.model_file import ToolShape
 from palpate.progress import NO_PROGRESS, Progress
 from palpate.scene.schema import (
@@ -55,7 +56,7 @@ def build_cloud(config: Config, folder: Path, progress: Progress = NO_PROGRESS) 
             loaded = load_surface(folder / file, unit)
             for note in loaded.notes:
                 progress.warn(note)
-            areas = _working_areas(config, loaded.surface)
+            areas = (*_working_areas(config, loaded.surface), *finer_around_inclusions(config, folder))
             return fill_surface(loaded.surface, spacing, refinements(config), areas)
 
 

@@ -9,10 +9,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 from palpate.factorization import solver_name
-from palpate.scene.schema import Config, SurfaceGeometry
+from palpate.scene.schema import Config, SurfaceGeometry, surface_files
 from palpate.stage_cache import key_of
 
-_CLOUD = ("files.py", "scene", "geometry", "scene_cloud.py")
+_CLOUD = ("files.py", "scene", "geometry", "scene_cloud.py", "inclusions.py")
 _BODY = (*_CLOUD, "meshfree", "discretization", "factorization")
 _MODES = (*_BODY, "modes")
 _LIBRARIES = ("numpy", "scipy", "numba", "libigl")
@@ -34,18 +34,26 @@ class StageKeys:
 def stage_keys(config: Config, folder: Path) -> StageKeys:
     """The keys of a scene, whose files are relative to `folder`. Raises FileNotFoundError where the surface is not there."""
     scene = config.model_dump(
-        mode="json", include={"geometry", "fixed", "contact", "discretization", "surface", "tool"}
+        mode="json",
+        include={"geometry", "fixed", "contact", "discretization", "surface", "tool", "inclusion"},
     )
     geometry = scene["geometry"]
     patches = [[c["point_m"], c["radius_m"], c["spacing_m"]] for c in scene["contact"]]
+    files = [hashlib.sha256((folder / file).read_bytes()).hexdigest() for _, file in surface_files(config)]
+    for table in (geometry, *scene["inclusion"]):
+        table.pop("file", None)
+    shapes = [
+        {key: value for key, value in table.items() if key != "relative_stiffness"}
+        for table in scene["inclusion"]
+        if table["spacing_m"] is not None
+    ]
     refined: list[object] = []
     if isinstance(config.geometry, SurfaceGeometry):
-        geometry["file"] = hashlib.sha256((folder / config.geometry.file).read_bytes()).hexdigest()
         refined = [p for p in patches if p[2] is not None]
-    finer = [refined, scene["surface"], bool(scene["tool"])]
-    cloud = key_of(_code(_CLOUD), geometry, finer)
+    finer = [refined, shapes, scene["surface"], bool(scene["tool"])]
+    cloud = key_of(_code(_CLOUD), geometry, files, finer)
     body = key_of(
-        _code(_BODY), cloud, scene["fixed"], patches, scene["discretization"],
+        _code(_BODY), cloud, scene["fixed"], patches, scene["discretization"], scene["inclusion"],
         config.material.material().poissons_ratio, solver_name(),
     )  # fmt: skip
     return StageKeys(cloud, body, key_of(_code(_MODES), body))

@@ -53,10 +53,12 @@ def assemble(
     require_volumes(cloud)
     basis, pattern, gradient = gradient_in_cells(cloud, support_radius_factor)
     mu, volumetric = material.shear_modulus_pa, material.lame_lambda_pa
+    relative = cloud.relative_stiffness
+    stiff_volumes = cloud.volumes if relative is None else cloud.volumes * relative
     return AssembledBody(
         basis=basis,
         stiffness=isotropic_stiffness(
-            pattern, gradient, cloud.volumes, np.array([volumetric, *3 * [-2 / 3 * mu]]), mu
+            pattern, gradient, stiff_volumes, np.array([volumetric, *3 * [-2 / 3 * mu]]), mu
         ),
         mass=material.density_kg_per_m3 * inertial_volumes(cloud, basis),
         supports=held,

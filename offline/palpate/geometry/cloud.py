@@ -38,6 +38,7 @@ class NodeCloud:
     spacing  (n_nodes,), m; local distance between neighboring nodes, from which the support radius follows
     surface  the body's boundary
     gaps     across which nodes are no neighbors; None where there can be none, as in a convex body
+    relative_stiffness  (n_nodes,), Young's modulus of the nodes' cells over the material's; None: 1 everywhere
     """
 
     points: NDArray[np.float64]
@@ -50,6 +51,7 @@ class NodeCloud:
     spacing: NDArray[np.float64]
     surface: TriangleSurface
     gaps: Gaps | None = None
+    relative_stiffness: NDArray[np.float64] | None = None
 
     @property
     def n_nodes(self) -> int:

@@ -91,21 +91,21 @@ def ball(radius_m: float, spacing_m: float) -> NodeCloud:
     spacing_m  > 0, at most half the radius
     """
     area, volume = 4 * np.pi * radius_m**2, 4 / 3 * np.pi * radius_m**3
-    directions = _spiral(round(area / spacing_m**2))
+    outward = directions(round(area / spacing_m**2))
     interior = _grid_in_ball(radius_m - 0.6 * spacing_m, spacing_m, offset=0.0)
-    points = np.vstack([interior, radius_m * directions])
+    points = np.vstack([interior, radius_m * outward])
     on_surface = np.arange(len(points)) >= len(interior)
 
     fine = spacing_m / _SAMPLES_A_SPACING
     samples = _grid_in_ball(radius_m, fine, offset=0.5)
     cells = tributary_cells(points, samples, np.ones(len(samples)), volume)
-    skin = radius_m * _spiral(round(area / fine**2))
+    skin = radius_m * directions(round(area / fine**2))
     areas = np.zeros(len(points))
     areas[on_surface] = tributary_measures(points[on_surface], skin, np.ones(len(skin)), area)
     normals = np.zeros_like(points)
-    normals[on_surface] = directions
-    hull = ConvexHull(directions).simplices
-    corners = directions[hull]
+    normals[on_surface] = outward
+    hull = ConvexHull(outward).simplices
+    corners = outward[hull]
     inward = np.einsum("ti,ti->t", np.cross(corners[:, 0], corners[:, 1]), corners[:, 2]) < 0
     hull[inward] = hull[inward][:, ::-1]
     return NodeCloud(
@@ -117,7 +117,7 @@ def ball(radius_m: float, spacing_m: float) -> NodeCloud:
         areas=areas,
         boundary=on_surface,
         spacing=np.full(len(points), spacing_m),
-        surface=TriangleSurface(vertices=radius_m * directions, triangles=hull.astype(np.int32)),
+        surface=TriangleSurface(vertices=radius_m * outward, triangles=hull.astype(np.int32)),
     )
 
 
@@ -134,7 +134,7 @@ def _midpoints(low: Array, high: Array, cells: NDArray[np.int64]) -> tuple[Array
     return points, np.full(len(points), total / len(points)), total
 
 
-def _spiral(count: int) -> Array:
+def directions(count: int) -> Array:
     """(count, 3), nearly evenly spread unit vectors on the Fibonacci (golden-angle) spiral."""
     i = np.arange(count)
     z = 1 - (2 * i + 1) / count

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 import tomllib
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from palpate.model_file import LONGEST_PERIOD_S, SHORTEST_PERIOD_S
+from palpate.scene.inclusions import Inclusion, SurfaceInclusion
 from palpate.scene.material import Material, PronySeries, check_constant
 from palpate.scene.quantities import (
     SHORTEST_M,
@@ -232,6 +234,7 @@ class Config(Table):
     geometry: Annotated[BoxGeometry | BallGeometry | SurfaceGeometry, Field(discriminator="shape")]
     material: MaterialTable
     fixed: tuple[Annotated[Region, Field(discriminator="region")], ...] = Field(min_length=1)
+    inclusion: tuple[Annotated[Inclusion, Field(discriminator="shape")], ...] = ()
     contact: tuple[ContactTable, ...] = ()
     tool: tuple[ToolTable, ...] = ()
     surface: SurfaceTable = SurfaceTable()
@@ -266,6 +269,7 @@ class Config(Table):
             return self
         refined = [f"contact {c.name!r}" for c in self.contact if c.spacing_m is not None]
         refined += ["surface"] if self.surface.spacing_m is not None else []
+        refined += [f"inclusion[{i}]" for i, part in enumerate(self.inclusion) if part.spacing_m is not None]
         if refined:
             raise ValueError(
                 f"{refined[0]} has spacing_m, but a {self.geometry.shape} is a uniform cloud: only a surface's cloud can be refined"
@@ -283,6 +287,20 @@ class Config(Table):
                 if value != needed:
                     other = "" if self.tool else "; or choose another, such as 'tbr-band'"
                     raise ValueError(f"{key} = {value!r}: {needs} {needed!r}{other}")
+        return self
+
+    @model_validator(mode="after")
+    def _inclusions_suit(self) -> Config:
+        if self.inclusion and self.discretization.method != "conservative":
+            raise ValueError(
+                f"discretization.method = {self.discretization.method!r}: [[inclusion]] needs 'conservative'"
+            )
+        for index, part in enumerate(self.inclusion):
+            coarsest = getattr(self.geometry, "spacing_m", math.inf)
+            if part.spacing_m is not None and part.spacing_m > coarsest:
+                raise ValueError(
+                    f"inclusion[{index}].spacing_m = {part.spacing_m:g}: expected at most geometry.spacing_m, {coarsest:g}"
+                )
         return self
 
     @model_validator(mode="after")
@@ -355,25 +373,43 @@ def canonical_text(config: Config) -> str:
 
 
 def _of_the_other_kind(config: Config) -> set[str]:
-    """The tables that have no meaning in a scene of this kind."""
-    return {"contact", "reduction"} if config.tool else {"tool", "surface"}
+    """The tables that have no meaning in a scene of this kind, and inclusions where there are none."""
+    return ({"contact", "reduction"} if config.tool else {"tool", "surface"}) | (
+        set() if config.inclusion else {"inclusion"}
+    )
 
 
 def fingerprint(config: Config, folder: Path) -> str:
-    """SHA-256 of `canonical_text` followed by the surface file's bytes, hexadecimal.
+    """SHA-256 of `canonical_text` followed by the bytes of the scene's surface files, hexadecimal.
 
-    Raises FileNotFoundError when the surface, relative to `folder`, is not there.
+    Raises FileNotFoundError when one of them, relative to `folder`, is not there.
     """
     digest = hashlib.sha256(canonical_text(config).encode())
-    if isinstance(config.geometry, SurfaceGeometry):
-        surface = folder / config.geometry.file
+    for key, file in surface_files(config):
+        surface = folder / file
         if not surface.is_file():
-            raise FileNotFoundError(f"geometry.file = {config.geometry.file!r}: no such file as {surface}")
+            raise FileNotFoundError(f"{key} = {file!r}: no such file as {surface}")
         digest.update(surface.read_bytes())
     return digest.hexdigest()
 
 
-_TAGS = {"shape": ("box", "ball", "surface"), "region": ("box", "plane", "sphere", "nearest")}
+def surface_files(config: Config) -> list[tuple[str, str]]:
+    """The key and the name of each surface file that the scene names."""
+    files = [("geometry.file", config.geometry.file)] if isinstance(config.geometry, SurfaceGeometry) else []
+    return files + [
+        (f"inclusion[{i}].file", part.file)
+        for i, part in enumerate(config.inclusion)
+        if isinstance(part, SurfaceInclusion)
+    ]
+
+
+_TAGS = {
+    "geometry": ("box", "ball", "surface"),
+    "inclusion": ("sphere", "surface"),
+    "fixed": ("box", "plane", "sphere", "nearest"),
+    "surface": ("box", "plane", "sphere"),
+}
+"""What the tables of a scene may be of: their shapes or regions."""
 _BOUNDS = {
     "greater_than": "above",
     "greater_than_equal": "at least",
@@ -385,7 +421,7 @@ _UNIT_HINTS = {"period_s": " (in s: 1 ms is 0.001)", "tolerance": " (a fraction:
 
 def _line(error: Any) -> str:
     """One of pydantic's errors as a line: the key, the value and what was expected."""
-    tags = (*_TAGS["shape"], *_TAGS["region"])
+    tags = {tag for table in _TAGS.values() for tag in table}
     parts = [part for i, part in enumerate(error["loc"]) if i == 0 or part not in tags]
     key = ""
     for part in parts:
@@ -393,7 +429,13 @@ def _line(error: Any) -> str:
     key, last = key or "scene", str(parts[-1]) if parts else ""
     value, message = error["input"], error["msg"].removeprefix("Value error, ")
     match error["type"]:
-        case "tuple_type" if parts in (["fixed"], ["contact"], ["tool"], ["surface", "working_area"]):
+        case "tuple_type" if parts in (
+            ["fixed"],
+            ["contact"],
+            ["tool"],
+            ["inclusion"],
+            ["surface", "working_area"],
+        ):
             return f"{key}: expected a list of tables, [[{key}]]"
         case "missing":
             return f"{key}: missing, it is required"
@@ -402,7 +444,7 @@ def _line(error: Any) -> str:
         case "union_tag_invalid" | "union_tag_not_found":
             tag = error["ctx"]["discriminator"].strip("'")
             got = f" = {error['ctx']['tag']!r}:" if "tag" in error["ctx"] else ": missing,"
-            return f"{key}.{tag}{got} expected one of {error['ctx'].get('expected_tags', ', '.join(map(repr, _TAGS[tag])))}"
+            return f"{key}.{tag}{got} expected one of {error['ctx'].get('expected_tags', ', '.join(map(repr, _TAGS[parts[0]])))}"
         case "value_error":
             if last and message.startswith(f"{last} = "):  # a field's own words
                 return key.removesuffix(last) + message

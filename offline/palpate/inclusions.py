@@ -1,0 +1,93 @@
+"""The stiffness of each node's cell where a scene has inclusions, and the finer nodes that they ask for.
+
+A cell that the inclusion's surface cuts has the mean stiffness of its two parts. The part inside is that of a cell as wide as
+this one, cut at right angles at its centroid's distance from the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.geometry.cloud import NodeCloud
+from palpate.geometry.measures import enclosed_volume, triangle_normals
+from palpate.geometry.sampling import depth_inside, sample_elements
+from palpate.geometry.shapes import directions
+from palpate.geometry.spacing import RefinedArea
+from palpate.geometry.surface import load_surface
+from palpate.scene.inclusions import Inclusion, SphereInclusion
+from palpate.scene.schema import Config, SurfaceGeometry
+
+Array = NDArray[np.float64]
+
+_SAMPLES_A_SPACING = 2
+
+_LARGEST_LOSS = 0.1
+"""Of an inclusion's volume: what the cells inside may lack or have too much before the build warns."""
+
+
+def with_inclusions(config: Config, folder: Path, cloud: NodeCloud, warn: Callable[[str], None]) -> NodeCloud:
+    """The cloud with the stiffness that the scene's inclusions give its cells.
+
+    Where inclusions overlap, the later one counts. Files are relative to `folder`.
+
+    Raises FileNotFoundError, SurfaceError; ValueError naming an inclusion that holds no part of the body.
+    """
+    if not config.inclusion:
+        return cloud
+    stiffness = np.ones(cloud.n_nodes)
+    width = np.sqrt(12 * np.trace(cloud.moments, axis1=1, axis2=2) / 3)
+    for index, inclusion in enumerate(config.inclusion):
+        depth, volume = _depth_and_volume(inclusion, folder, cloud.centroids)
+        inside = np.clip(0.5 + depth / width, 0.0, 1.0)
+        held = float(inside @ cloud.volumes)
+        if held == 0:
+            raise ValueError(
+                f"inclusion[{index}]: holds no part of the body, whose nearest node is {-depth.max():.3g} m outside: expected an "
+                "inclusion within the body, in m"
+            )
+        if abs(held / volume - 1) > _LARGEST_LOSS:
+            warn(
+                f"inclusion[{index}]: {held * 1e6:.3g} cm³ of the nodes' cells lie in it, its volume is {volume * 1e6:.3g} cm³: "
+                "expected it within the body, and a spacing_m of a third of its thickness or less"
+            )
+        stiffness += inside * (inclusion.relative_stiffness - stiffness)
+    return replace(cloud, relative_stiffness=stiffness)
+
+
+def finer_around_inclusions(config: Config, folder: Path) -> tuple[RefinedArea, ...]:
+    """The surfaces of the inclusions that ask for finer nodes. Raises FileNotFoundError, SurfaceError."""
+    geometry = config.geometry
+    if not isinstance(geometry, SurfaceGeometry):
+        return ()
+    return tuple(
+        RefinedArea(*_skin(inclusion, inclusion.spacing_m, folder), inclusion.spacing_m, geometry.growth)
+        for inclusion in config.inclusion
+        if inclusion.spacing_m is not None
+    )
+
+
+def _depth_and_volume(inclusion: Inclusion, folder: Path, points: Array) -> tuple[Array, float]:
+    """Depth of points (n, 3) inside the inclusion, m, (n,), and its volume, m³."""
+    if isinstance(inclusion, SphereInclusion):
+        away = np.linalg.norm(points - np.asarray(inclusion.center_m), axis=1)
+        return inclusion.radius_m - away, 4 / 3 * np.pi * inclusion.radius_m**3
+    surface = load_surface(folder / inclusion.file, inclusion.file_unit).surface
+    return depth_inside(points, surface), enclosed_volume(surface)
+
+
+def _skin(inclusion: Inclusion, spacing_m: float, folder: Path) -> tuple[Array, float]:
+    """Samples (n, 3) of the inclusion's surface, m, half a spacing apart, and its area, m²."""
+    if isinstance(inclusion, SphereInclusion):
+        area = 4 * np.pi * inclusion.radius_m**2
+        count = int(np.ceil(area * (_SAMPLES_A_SPACING / spacing_m) ** 2))
+        return np.asarray(inclusion.center_m) + inclusion.radius_m * directions(count), area
+    surface = load_surface(folder / inclusion.file, inclusion.file_unit).surface
+    samples, _ = sample_elements(
+        surface.vertices, surface.triangles, lambda p: np.full(len(p), spacing_m), 1 / _SAMPLES_A_SPACING
+    )
+    return samples.points, float(triangle_normals(surface)[1].sum())
