@@ -51,6 +51,7 @@ ROOMS = (
     ("model_file", "lti.pole_residue"),  # the file holds a linear system: on one level
     "scene",
     "geometry",
+    "inclusions",
     "scene_cloud",
     "factorization",
     "meshfree",

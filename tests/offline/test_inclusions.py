@@ -117,7 +117,7 @@ def test_where_inclusions_overlap_the_later_one_counts(cloud: NodeCloud, folder:
     core = SCENE["inclusion"][0] | {"radius_m": 0.006, "relative_stiffness": 0.1}
     scene["inclusion"].append(core)
     stiffness = stiffness_of(cloud, scene, folder)
-    assert stiffness.min() == 0.1
+    assert stiffness.min() == pytest.approx(0.1)
     assert stiffness.max() == 10.0
 
 
