@@ -1,18 +1,24 @@
-"""Shape functions with all first and second derivatives: the compiled kernel against the same algebra in batched numpy.
+"""Shape functions with all first and second derivatives: the compiled kernel beside batched numpy and pycompadre.
 
-    python benchmarks/shape_functions.py [--points 10000] [--order 2]
+    python benchmarks/shape_functions.py [--points 10000] [--order 2] [--threads 1]
 
-Both get the same neighbor lists, so that only the evaluation is compared; the ratio of points per second is printed,
-and the largest relative difference of the results, which shows that both compute the same.
+All get the same neighbor lists, so that only the evaluation is compared. batched numpy is the same algebra by einsum and
+batched solves: the largest relative difference shows that both compute the same. pycompadre (not in an extra) is Compadre's
+generalized moving least squares with another weight function, by LU, its faster solver, of five operators instead of ten:
+value, gradient and Laplacian; its largest error on a quadratic field shows that it computes what it should. The kernel and
+pycompadre use as many threads as are told, numpy one.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from numba import set_num_threads
 from numpy.typing import NDArray
 
 from palpate.meshfree.kernel import Evaluated, Pairs, evaluate
@@ -84,6 +90,41 @@ def batched_numpy(
     return out
 
 
+def compadre(
+    points: Array, x: Array, radii: Array, indptr: NDArray[np.int32], indices: NDArray[np.int32], order: int
+) -> tuple[Callable[[], Array], Any]:
+    """What makes pycompadre's operators and returns the errors (n_points,) of x² + y z's gradient; and Kokkos, to be kept."""
+    import pycompadre
+
+    kokkos = pycompadre.KokkosParser([f"--kokkos-num-threads={os.environ['OMP_NUM_THREADS']}"])
+    counts = np.diff(indptr)
+    lists = np.zeros((len(points), counts.max() + 1), np.int32)
+    lists[:, 0] = counts
+    lists[:, 1:][np.arange(counts.max()) < counts[:, None]] = indices
+    operation = pycompadre.TargetOperation
+
+    def run() -> Array:
+        gmls = pycompadre.GMLS(order, 3, "LU", "STANDARD")
+        gmls.setWeightingType("power")
+        gmls.setWeightingParameter(2)
+        helper = pycompadre.ParticleHelper(gmls)
+        helper.generateKDTree(x)
+        helper.setTargetSites(points)
+        helper.setNeighbors(lists)
+        helper.setWindowSizes(np.full(len(points), radii.max()))
+        gradient = operation.GradientOfScalarPointEvaluation
+        targets = [operation.ScalarPointEvaluation, gradient, operation.LaplacianOfScalarPointEvaluation]
+        gmls.addTargets(targets[: order + 1])
+        gmls.generateAlphas(1, False)
+        field = x[:, 0] ** 2 + x[:, 1] * x[:, 2] if order == 2 else x @ (1.0, 2.0, 3.0)
+        exact = (
+            points[:, [0, 2, 1]] * (2, 1, 1) if order == 2 else np.broadcast_to((1.0, 2.0, 3.0), points.shape)
+        )
+        return np.asarray(np.linalg.norm(helper.applyStencil(field, gradient) - exact, axis=1))
+
+    return run, kokkos
+
+
 def seconds(function: Callable[[], Array], repeats: int) -> tuple[float, Array]:
     """Best time of the repeats, after one run that compiles and warms up."""
     result = function()
@@ -101,7 +142,10 @@ def main() -> None:
     )
     parser.add_argument("--points", type=int, default=10_000)
     parser.add_argument("--order", type=int, choices=(1, 2), default=2)
+    parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
+    os.environ["OMP_NUM_THREADS"] = str(arguments.threads)
+    set_num_threads(arguments.threads)
 
     n = round(arguments.points ** (1 / 3)) + 4
     h = 1 / (n - 1)
@@ -118,12 +162,22 @@ def main() -> None:
     peer, b = seconds(lambda: batched_numpy(points, x, radii, indptr, indices, arguments.order), 1)
     difference = max(np.abs(u - v).max() / np.abs(v).max() for u, v in zip(a, b, strict=True))
     print(
-        f"{len(points)} points, order {arguments.order}, {len(indices) / len(points):.1f} neighbors, value + 3 + 6 derivatives"
+        f"{len(points)} points, {arguments.threads} thread(s), order {arguments.order}, {len(indices) / len(points):.1f} neighbors, value + 3 + 6 derivatives"
     )
     print(f"neighbor search (scipy cKDTree)  {len(points) / search:12,.0f} points/s")
     print(f"compiled kernel                   {len(points) / ours:12,.0f} points/s")
     print(f"batched numpy                     {len(points) / peer:12,.0f} points/s")
     print(f"ratio {peer / ours:.0f}, largest relative difference {difference:.1e}")
+    try:
+        run, kokkos = compadre(points, x, radii, indptr, indices, arguments.order)
+    except ImportError:
+        print("pycompadre is not installed: pip install pycompadre")
+        return
+    other, errors = seconds(run, 3)
+    del run, kokkos
+    operators = 5 if arguments.order == 2 else 4
+    print(f"pycompadre, {operators} operators           {len(points) / other:12,.0f} points/s")
+    print(f"ratio {other / ours:.0f}, largest error of a gradient {errors.max():.1e}")
 
 
 if __name__ == "__main__":
