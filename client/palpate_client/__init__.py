@@ -10,6 +10,7 @@ from palpate_client.contract import Contract
 from palpate_client.errors import (
     ClientError,
     ConfigurationError,
+    DeviceLost,
     Incompatible,
     Refused,
     ServerGone,
@@ -34,6 +35,7 @@ __all__ = [
     "Connection",
     "Contract",
     "Description",
+    "DeviceLost",
     "Force",
     "Frame",
     "Geometry",

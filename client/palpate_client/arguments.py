@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
+import sys
 from collections.abc import Callable
 
 from palpate_client import wire
@@ -40,6 +42,16 @@ def connection_for(options: argparse.Namespace) -> Connection:
     """The connection that these options ask for, to be entered."""
     name = getattr(options, "name", None)
     return Connection(options.connect, options.session, zenoh_config=options.zenoh_config, name=name)
+
+
+def failed(program: str, error: Exception, code: int) -> int:
+    """Say in one line why a program ends, and give its exit code; with `palpate --debug` the error is raised instead."""
+    if os.environ.get("PALPATE_DEBUG"):
+        raise error
+    from palpate.files import printable
+
+    print(printable(f"{program}: {error}"), file=sys.stderr)
+    return code
 
 
 def plain_name(text: str) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import re
 import threading
 import time
@@ -331,7 +333,8 @@ def open_session(endpoint: str, zenoh_config: str | Path | None = None) -> zenoh
         return zenoh.open(config)
     except zenoh.ZError as error:
         place = endpoint if zenoh_config is None else zenoh_config
-        raise ServerGone(f"nothing answers at {place}: {_words(error)}") from error
+        hint = "does `palpate serve` run there?"
+        raise ServerGone(f"nothing answers at {place}: {_words(error)}; {hint}") from error
 
 
 def _configuration(endpoint: str, zenoh_config: str | Path | None) -> zenoh.Config:
@@ -364,13 +367,13 @@ def _words(error: zenoh.ZError) -> str:
 
 
 def steps(duration_s: float, period_s: float) -> Iterator[int]:
-    """Give 0, 1, 2, ..., one each period. Deadlines count from the start, so that errors don't add up.
+    """Give 0, 1, 2, ..., one each period, for a duration that may be infinite. Deadlines count from the start, so that errors don't add up.
 
     They are multiples of the period on this machine's clock: the server's deadlines, which follow the commands, need not
     move when one loop takes over from another.
     """
     start = -(-time.monotonic() // period_s) * period_s
-    for i in range(round(duration_s / period_s)):
+    for i in itertools.count() if math.isinf(duration_s) else range(round(duration_s / period_s)):
         wait = start + i * period_s - time.monotonic()
         if wait > 0:
             time.sleep(wait)

@@ -19,6 +19,10 @@ class ToolLost(ClientError):
     """The server runs, but the tool is no longer ours: acquire it again, or give up."""
 
 
+class DeviceLost(ClientError):
+    """The haptic device or its driver can't be used, or is gone."""
+
+
 class Incompatible(ClientError):
     """The server speaks another schema version, or serves another model than the one that was agreed on."""
 

@@ -19,11 +19,12 @@ from typing import Any
 
 import zenoh
 
-from palpate_client.arguments import add_connection_options, connection_for, positive
+from palpate_client.arguments import add_connection_options, connection_for, failed, positive
 from palpate_client.connection import Connection, steps
 from palpate_client.errors import ClientError, ServerGone, ToolLost
 from palpate_client.messages import Description
 from palpate_client.tool import Tool
+from palpate_client.trajectory import Trajectory, read_trajectory
 
 STATUS_WAIT_S = 1.0  # statuses come ten times a second
 
@@ -32,16 +33,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse_options(arguments)
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # silent unless RUST_LOG says otherwise
     try:
+        # A file that can't be read is found before anything moves.
+        trajectory = None if options.trajectory is None else read_trajectory(options.trajectory)
         with connection_for(options) as connection:
-            return run(connection, options)
+            return run(connection, options, trajectory)
     except (ClientError, OSError, ValueError) as error:
-        print(f"palpate client: {error}", file=sys.stderr)
-        return 2
+        return failed("palpate client", error, 2)
     except KeyboardInterrupt:  # before anything was moved
         return 130
 
 
-def run(connection: Connection, options: argparse.Namespace) -> int:
+def run(connection: Connection, options: argparse.Namespace, trajectory: Trajectory | None) -> int:
     if options.record is not None:
         from palpate.files import check_output
 
@@ -58,7 +60,10 @@ def run(connection: Connection, options: argparse.Namespace) -> int:
     before = connection.status
     try:
         with held:
-            poke(tool, motion(options), options)
+            if trajectory is None:
+                move(tool, poke(tool, options), options.duration_s, options.rate_hz)
+            else:
+                move(tool, trajectory.at, trajectory.duration_s, options.rate_hz)
     except KeyboardInterrupt:
         interrupted = True
     except ServerGone as error:
@@ -87,21 +92,30 @@ def run(connection: Connection, options: argparse.Namespace) -> int:
     return 3 if unwritten else 0
 
 
-def poke(tool: Tool, depth: Callable[[float], tuple[float, float]], options: argparse.Namespace) -> None:
-    """Send a command each period until the duration is over. Raises ServerGone or ToolLost."""
-    period_s = 1 / options.rate_hz
-    for i in steps(options.duration_s, period_s):
-        depth_m, speed_m_per_s = depth(i * period_s)
-        tool.move(tool.at_depth(depth_m), [-speed_m_per_s * n for n in tool.normal])
+def move(
+    tool: Tool,
+    path: Callable[[float], tuple[Sequence[float], Sequence[float]]],
+    duration_s: float,
+    rate_hz: float,
+) -> None:
+    """Send position and velocity of a path over time, s, until the duration is over. Raises ServerGone or ToolLost."""
+    for i in steps(duration_s, 1 / rate_hz):
+        tool.move(*path(i / rate_hz))
 
 
-def motion(options: argparse.Namespace) -> Callable[[float], tuple[float, float]]:
-    """Depth (m, inwards) and its speed (m/s) at a time (s) since the start; both motions begin at depth 0."""
+def poke(tool: Tool, options: argparse.Namespace) -> Callable[[float], tuple[list[float], list[float]]]:
+    """Position, m, and velocity, m/s, at a time (s) since the start, along the tool's normal; both motions begin at depth 0."""
     w, amplitude_m = 2 * math.pi * options.frequency_hz, options.amplitude_m
-    if options.motion == "poke":
-        half = amplitude_m / 2
-        return lambda t: (half * (1 - math.cos(w * t)), half * w * math.sin(w * t))
-    return lambda t: (amplitude_m * math.sin(w * t), amplitude_m * w * math.cos(w * t))
+    half = amplitude_m / 2
+
+    def at(t: float) -> tuple[list[float], list[float]]:
+        if options.motion == "poke":
+            depth_m, speed_m_per_s = half * (1 - math.cos(w * t)), half * w * math.sin(w * t)
+        else:
+            depth_m, speed_m_per_s = amplitude_m * math.sin(w * t), amplitude_m * w * math.cos(w * t)
+        return tool.at_depth(depth_m), [-speed_m_per_s * n for n in tool.normal]
+
+    return at
 
 
 def not_carried_out(before: dict[str, Any] | None, after: dict[str, Any] | None) -> dict[str, int] | None:
@@ -180,6 +194,12 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         choices=("poke", "sine"),
         default="poke",
         help="poke: inwards and back; sine: about the rest position (%(default)s)",
+    )
+    parser.add_argument(
+        "--trajectory",
+        type=Path,
+        metavar="FILE.csv",
+        help="move as this file says, for as long as it says, instead of --motion: columns t_s, x_m, y_m, z_m, the tip in the model's frame",
     )
     for name, default, text in (
         ("--amplitude-m", 0.005, "largest depth, m"),

@@ -149,8 +149,8 @@ class Tool:
         """The point this far inside the undeformed surface, straight below `home_m`; m, in our frame and our unit."""
         return [h - depth_m * n for h, n in zip(self.home_m, self.normal, strict=True)]
 
-    def use_device(self, profile: str, damping_n_s_per_m: float) -> float:
-        """Tell the server which device renders, so that its limits hold and passivity control is on.
+    def use_device(self, profile: str, damping_n_s_per_m: float | None) -> float:
+        """Tell the server which device renders and its own damping, if known, so that its limits hold and passivity control is on.
 
         Keeps the tip at `home_m` for 1.5 s to measure how old a force is when it is rendered: the 99th percentile of the
         round trip, and up to a period until the next step. Returns that time, s. Then acquires the tool again; `warnings`

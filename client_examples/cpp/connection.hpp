@@ -39,6 +39,7 @@ struct Tool {
 
 struct Description {
     std::string model;  // the sha256 of what it was built from
+    bool touches_anywhere = false;  // a surface model, whose tools touch wherever they are, from outside
     std::vector<Tool> tools;
     Promise promise;
 };
@@ -236,7 +237,9 @@ class Connection {
             throw Refused("the server speaks schema version " + std::to_string(version) + ", this client " +
                           std::to_string(schema_version) + ": take both from the same version of palpate");
         }
-        description_.model = field(field(answer, "model"), "config_sha256").as<std::string>();
+        const auto& model = field(answer, "model");
+        description_.model = field(model, "config_sha256").as<std::string>();
+        description_.touches_anywhere = field(model, "kind").as<std::string>() == "surface";
         for (const auto& tool : field(answer, "tools").as<std::vector<msgpack::object>>()) {
             description_.tools.push_back({field(tool, "name").as<std::string>(), field(tool, "start_m").as<Vec3>(),
                                           field(tool, "normal").as<Vec3>()});

@@ -71,9 +71,11 @@ class Bridge {
           tool_(connection.description().tools[tool]),
           inwards_(-1.0 * tool_.normal),
           options_(options),
+          touches_anywhere_(connection.description().touches_anywhere),
           period_ns_(std::llround(connection.description().promise.period_s * 1e9)),
+          hold_ns_(std::llround(connection.description().promise.hold_s * 1e9)),
           contract_(connection.description().promise),
-          gate_(std::llround(connection.description().promise.hold_s * 1e9)) {
+          gate_(hold_ns_) {
         connection.receive_forces(tool);
     }
 
@@ -161,11 +163,17 @@ class Bridge {
         const Vec3 position = device.position_m();
         const double depth = dot(position, inwards_);
         deepest_m_ = std::max(deepest_m_, depth);
-        // The tip is outside the tissue until its position is inside it; then it sticks to where it touched.
-        const bool inside = gate_.open(now_ns() - newest_.arrival_ns, depth > 0);
-        if (!inside) touched_ = position - depth * inwards_;
+        // A surface model is touched wherever the hand is. The tip of a patch model is outside the tissue until its position
+        // is inside it; then it sticks to where it touched.
+        const std::int64_t silence_ns = now_ns() - newest_.arrival_ns;
+        const bool inside = touches_anywhere_ ? silence_ns <= hold_ns_ : gate_.open(silence_ns, depth > 0);
+        if (touches_anywhere_) {
+            touched_ = Vec3{};
+        } else if (!inside) {
+            touched_ = position - depth * inwards_;
+        }
         Command command;
-        command.position_m = inside ? home_m_ + (position - touched_) : home_m_;
+        command.position_m = inside || touches_anywhere_ ? home_m_ + (position - touched_) : home_m_;
         // The velocity lets the server carry the motion on when a command is late; the tick tells it which of
         // its forces acted until now, so that it can count the energy exactly although messages take time.
         command.velocity_m_per_s = inside ? device.velocity_m_per_s() : Vec3{};
@@ -217,7 +225,8 @@ class Bridge {
     const Tool& tool_;
     const Vec3 inwards_;
     const Options& options_;
-    std::int64_t period_ns_;
+    const bool touches_anywhere_;
+    const std::int64_t period_ns_, hold_ns_;
     Deadlines deadlines_{period_ns_};
     Contract contract_;
     Gate gate_;
