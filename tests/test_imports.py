@@ -33,10 +33,12 @@ ALLOWED = {
 PROGRAMS = {
     "palpate_server.__main__": ("palpate_client.arguments",),
     "palpate_server.recording.record": ("palpate_client",),
+    "palpate_server.recording.replay": ("palpate_client.arguments",),
     "palpate_server.diagnostics": ("palpate_client",),
     "palpate.demo": ("palpate_client",),
     "palpate.cli": ("palpate_client",),
     "palpate.commands": ("palpate_client",),
+    "palpate.versions": ("palpate_client",),
 }
 """What some may import beside that: these programs are clients themselves."""
 
@@ -72,7 +74,9 @@ ROOMS = (
     "stages",
     "demo",
     "commands",
+    "versions",
     "cli",
+    "completion",
     "__main__",
 )
 """The offline rooms, in the order of the chain: a room imports those before it, and those on its level."""

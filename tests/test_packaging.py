@@ -58,6 +58,7 @@ def test_a_plain_installation_is_a_client() -> None:
         "recorder",
         "experiments",
         "images",
+        "completion",
         "all",
     }
 

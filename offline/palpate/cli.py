@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import os
 import signal
@@ -39,6 +40,7 @@ COMMANDS = {
     "client": Command(_TOUCH, "poke a running server and check every answer", "", "palpate_client.poke"),
     "record": Command(_WATCH, "have a running server record its session to an MCAP file", "", "palpate_server.recording.record"),
     "replay": Command(_WATCH, "repeat a recording offline and compare bit for bit", "recorder", "palpate_server.recording.replay"),
+    "completion": Command("This command line", "print what a shell needs to complete commands and options", "completion", "palpate.completion"),
     "reproduce": Command("The paper", "regenerate the figures of BaniHani & De 2009", "experiments", "palpate.commands", "reproduce"),
 }  # fmt: skip
 
@@ -51,17 +53,22 @@ def main() -> int:
             return _fail(
                 f"argument {position}, '{printable(text)}', has characters that can't be shown: expected plain text"
             )
+    if "--debug" in arguments:
+        arguments.remove("--debug")
+        os.environ["PALPATE_DEBUG"] = "1"  # also for the programs that a command starts
     name = arguments[0] if arguments else "--help"
     if name in ("--help", "-h"):
         print(_help())
         return 0
     if name == "--version":
-        from importlib.metadata import version
+        from palpate.versions import versions_text
 
-        print(f"palpate {version('palpate')}")
+        print(versions_text(as_json="--json" in arguments))
         return 0
     if name not in COMMANDS:
-        return _fail(f"there is no command '{name}': expected one of {', '.join(COMMANDS)}")
+        near = difflib.get_close_matches(name, COMMANDS, 1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        return _fail(f"there is no command '{name}': expected one of {', '.join(COMMANDS)}{hint}")
     sys.argv = [f"palpate {name}", *arguments[1:]]
     return _run(name, COMMANDS[name])
 
@@ -85,7 +92,7 @@ def _run(name: str, command: Command) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at exit
         return 128 + signal.SIGPIPE
     except (ValueError, OSError, MemoryError) as error:
-        if os.environ.get("PALPATE_TRACEBACK"):
+        if os.environ.get("PALPATE_DEBUG"):
             raise
         return _fail(str(error) or "out of memory")
 
@@ -105,5 +112,9 @@ def _help() -> str:
     for group in dict.fromkeys(command.group for command in COMMANDS.values()):
         lines += ["", f"{group}:"]
         lines += [f"  {name:<12}{c.summary}" for name, c in COMMANDS.items() if c.group == group]
-    lines += ["", "`palpate COMMAND --help` shows the options of a command, `palpate --version` the version."]
+    lines += [
+        "",
+        "`palpate COMMAND --help` shows the options of a command, `palpate --version` all versions that matter;",
+        "`--debug`, with any command, the traceback of an error. Exit codes: docs/commands.md.",
+    ]
     return "\n".join(lines)

@@ -7,6 +7,7 @@ import importlib
 import json
 import math
 import time
+from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,6 +42,9 @@ def build() -> None:
     )
     add_cache_options(parser)
     parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")
+    parser.add_argument(
+        "--json", action="store_true", help="the report as JSON; progress goes to standard error"
+    )
     options = parser.parse_args()
 
     with interrupts.ends_at_once():
@@ -52,9 +56,12 @@ def build() -> None:
     tolerance = None if options.tolerance is None else parse_tolerance(options.tolerance)
     scene = override_reduction(load_config(options.scene), options.method, options.order, tolerance)
     if options.dry_run:
-        from palpate.expected import expectation_text
+        from palpate.expected import expectation_json, expectation_text
 
-        print(expectation_text(scene, options.scene.parent))
+        folder = options.scene.parent
+        print(
+            json.dumps(expectation_json(scene, folder)) if options.json else expectation_text(scene, folder)
+        )
         return
     path = options.output or Path(f"{scene.name}.npz")
     inputs = [options.scene]
@@ -62,7 +69,7 @@ def build() -> None:
         inputs.append(options.scene.parent / surface)
     check_output(path, inputs)
     start = time.monotonic()
-    with stage_reporter() as stages:
+    with stage_reporter(to_stderr=options.json) as stages:
         stages("libraries")
         with interrupts.ends_at_once():
             from palpate.build import build_model
@@ -75,8 +82,12 @@ def build() -> None:
         )
         interrupts.check()
     save_model(model, path, inputs)
+    seconds = time.monotonic() - start
+    if options.json:
+        print(json.dumps({"file": str(path), "seconds": seconds} | model.summary(), indent=2))
+        return
     print(accuracy_text(model, options.verbose))
-    print(f"\nwrote {path} ({path.stat().st_size / 2**20:.1f} MiB) in {time.monotonic() - start:.0f} s")
+    print(f"\nwrote {path} ({path.stat().st_size / 2**20:.1f} MiB) in {seconds:.0f} s")
 
 
 def add_cache_options(parser: argparse.ArgumentParser) -> None:
@@ -111,16 +122,19 @@ def bank() -> None:
     )
     parser.add_argument("--workers", type=int, default=2, help="at once, not with Dask (%(default)s)")
     add_cache_options(parser)
+    parser.add_argument("--json", action="store_true", help="a line of JSON for each model as it is finished")
     options = parser.parse_args()
     if options.workers < 1:
         parser.error(f"--workers {options.workers}: expected at least 1")
     from palpate.bank import build_bank
 
     cache = chosen_cache(options)
-    with stage_reporter() as stages:
+    with stage_reporter(to_stderr=options.json) as stages:
         stages(f"{len(options.scenes)} scenes")
         for built in build_bank(options.scenes, options.out, cache, options.executor, options.workers):
             interrupts.check()
+            if options.json:
+                print(json.dumps(asdict(built) | {"path": str(built.path)}), flush=True)
             stages(f"{built.path}")
             stages.note(f"{built.n_states} states, force error in band {100 * built.error_in_band:.2g} %")
 
@@ -161,6 +175,7 @@ def surface() -> None:
     parser.add_argument(
         "--triangles", type=int, default=20_000, metavar="N", help="at most about so many (%(default)s)"
     )
+    parser.add_argument("--json", action="store_true", help="file and what was done as JSON")
     options = parser.parse_args()
     if not 100 <= options.triangles <= 1_000_000:
         parser.error(f"--triangles {options.triangles}: expected 100 to 1000000")
@@ -168,7 +183,7 @@ def surface() -> None:
         "palpate.geometry.label_surface",
         "surface_file",
         options.image,
-        options.output,
+        options,
         options.label,
         options.triangles,
     )
@@ -180,13 +195,17 @@ def repair() -> None:
     parser = argparse.ArgumentParser(description=repair.__doc__)
     parser.add_argument("surface", type=Path, metavar="IN", help="STL, OBJ, PLY, OFF, VTK or VTP")
     parser.add_argument("--output", "-o", type=Path, metavar="OUT.ply", required=True)
+    parser.add_argument("--json", action="store_true", help="file and what was changed as JSON")
     options = parser.parse_args()
-    _make_ply("palpate.geometry.repair", "repair_surface", options.surface, options.output)
+    _make_ply("palpate.geometry.repair", "repair_surface", options.surface, options)
 
 
-def _make_ply(module: str, function: str, source: Path, output: Path, *arguments: object) -> None:
+def _make_ply(
+    module: str, function: str, source: Path, options: argparse.Namespace, *arguments: object
+) -> None:
     """Write the PLY file that module.function(source, *arguments) makes, and print the lines that it returns with it."""
-    with stage_reporter() as stages:
+    output: Path = options.output
+    with stage_reporter(to_stderr=options.json) as stages:
         stages("libraries")
         with interrupts.ends_at_once():
             from palpate.files import check_output, write_atomically
@@ -198,7 +217,10 @@ def _make_ply(module: str, function: str, source: Path, output: Path, *arguments
         stages("surface")
         data, lines = make(source, *arguments)
     write_atomically(output, data, [source])
-    print(*lines, f"wrote {output}", sep="\n")
+    if options.json:
+        print(json.dumps({"file": str(output), "notes": lines}, indent=2))
+    else:
+        print(*lines, f"wrote {output}", sep="\n")
 
 
 def fit() -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from scipy.integrate import quad
 
@@ -122,12 +123,9 @@ def expected_stages(size: BodySize) -> list[ExpectedStage]:
 
 def expectation_text(config: Config, folder: Path) -> str:
     """What `palpate build --dry-run` prints. Raises as `expected_size`; ValueError for a scene with tools."""
-    if config.tool:
-        raise ValueError("--dry-run knows scenes with contacts: expected none with [[tool]]")
-    size = expected_size(config, folder)
+    size, stages = _expected(config, folder)
     lines = [f"{config.name}: about {size.n_nodes:,} nodes, {3 * size.n_nodes:,} unknowns", ""]
     lines += [f"{'stage':28} {'cpu s':>8} {'peak GiB':>9}"]
-    stages = expected_stages(size)
     lines += [f"{s.name:28} {s.seconds:8.0f} {s.peak_bytes / 2**30:9.1f}" for s in stages]
     most = max(s.peak_bytes for s in stages)
     lines += [
@@ -137,3 +135,21 @@ def expectation_text(config: Config, folder: Path) -> str:
         + ("." if most <= machine_memory() else ": too little, use a coarser cloud."),
     ]
     return "\n".join(lines)
+
+
+def expectation_json(config: Config, folder: Path) -> dict[str, Any]:
+    """The same with plain numbers, lists and names; docs/commands.md lists the fields."""
+    size, stages = _expected(config, folder)
+    return {
+        "name": config.name,
+        "n_nodes": size.n_nodes,
+        "stages": [asdict(stage) for stage in stages],
+        "machine_memory_bytes": machine_memory(),
+    }
+
+
+def _expected(config: Config, folder: Path) -> tuple[BodySize, list[ExpectedStage]]:
+    if config.tool:
+        raise ValueError("--dry-run knows scenes with contacts: expected none with [[tool]]")
+    size = expected_size(config, folder)
+    return size, expected_stages(size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import stat
 import tempfile
@@ -33,6 +34,17 @@ def is_plain_name(name: object) -> TypeGuard[str]:
         and name.isprintable()
         and len(os.fsencode(name)) <= LONGEST_NAME_BYTES
     )
+
+
+def missing(path: Path, what: str) -> FileNotFoundError:
+    """The error for a file that is not there, with the name in its folder that is most like it."""
+    try:
+        names = [entry.name for entry in path.parent.iterdir()]
+    except OSError:
+        names = []
+    near = difflib.get_close_matches(path.name, names, 1)
+    hint = f"; did you mean {path.parent / near[0]}?" if near else ""
+    return FileNotFoundError(printable(f"{path}: no such {what}{hint}"))
 
 
 def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TextIO
 
 from palpate import interrupts
 
@@ -13,8 +14,9 @@ from palpate import interrupts
 class Stages:
     """Call it with a stage's name when the stage begins; `note` adds its result, `warn` prints a warning."""
 
-    def __init__(self) -> None:
-        self._is_terminal = sys.stdout.isatty()
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._is_terminal = stream.isatty()
         self._name: str | None = None
         self._note = ""
         self._start = 0.0
@@ -38,24 +40,27 @@ class Stages:
         if self._name is not None:
             self._clear()
             mark, elapsed = "✗" if failed else "✓", time.monotonic() - self._start
-            print(f"{mark} {elapsed:6.1f} s  {self._name}  {self._note}".rstrip(), flush=True)
+            self._print(f"{mark} {elapsed:6.1f} s  {self._name}  {self._note}".rstrip() + "\n")
             self._name = None
 
     def _show(self) -> None:
         """The stage that runs, on a line that the next output replaces."""
         if self._is_terminal and self._name is not None:
             self._clear()
-            print(f"{self._name} ... {self._note}"[:78], end="", flush=True)
+            self._print(f"{self._name} ... {self._note}"[:78])
 
     def _clear(self) -> None:
         if self._is_terminal:
-            print("\r\x1b[2K", end="", flush=True)
+            self._print("\r\x1b[2K")
+
+    def _print(self, text: str) -> None:
+        print(text, end="", file=self._stream, flush=True)
 
 
 @contextmanager
-def stage_reporter() -> Iterator[Stages]:
-    """Stages whose last one is marked as failed if an exception leaves the block."""
-    stages = Stages()
+def stage_reporter(to_stderr: bool = False) -> Iterator[Stages]:
+    """Stages whose last one is marked as failed if an exception leaves the block; on standard output unless `to_stderr`."""
+    stages = Stages(sys.stderr if to_stderr else sys.stdout)
     try:
         yield stages
     except BaseException:

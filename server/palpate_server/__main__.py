@@ -18,7 +18,7 @@ import zenoh
 
 from palpate.files import make_folder, printable
 from palpate.model_file import ModelFileError, load_model
-from palpate_client.arguments import positive, positive_up_to
+from palpate_client.arguments import failed, positive, positive_up_to
 from palpate_client.wire import DEFAULT_ENDPOINT, DEFAULT_SESSION, Keys
 from palpate_server.arguments import index, need
 from palpate_server.coupling import models
@@ -53,8 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with transport.open_session(options.listen, options.zenoh_config) as session:
             serve(model, session, keys, how, stop, lambda: _announce(model, keys, options))
     except (OSError, ModelFileError, transport.TransportError, ValueError) as error:
-        print(printable(f"palpate serve: {error}"), file=sys.stderr)
-        return EXIT_REFUSED
+        return failed("palpate serve", error, EXIT_REFUSED)
     print("stopped", flush=True)
     return 0
 

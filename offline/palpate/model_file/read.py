@@ -14,7 +14,7 @@ from typing import IO, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.files import printable
+from palpate.files import missing, printable
 from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.model_file.check import check_model, refuse
 from palpate.model_file.members import (
@@ -63,13 +63,14 @@ def load_model(path: Path) -> ReducedModel | SurfaceModel:
     """
     shown = printable(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{shown}: no such model file")
+        raise missing(path, "model file")
     with path.open("rb") as file:
         try:
             model = _read(file)
             check_model(model)
         except ModelFileError as error:
-            raise ModelFileError(f"{shown}: {error}") from error
+            hint = "; a scene becomes a model with `palpate build`" if path.suffix == ".toml" else ""
+            raise ModelFileError(f"{shown}: {error}{hint}") from error
         except MemoryError:
             raise
         except Exception as error:  # zipfile and zlib raise a dozen kinds on damaged bytes

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from palpate.files import missing
 from palpate.model_file import LONGEST_PERIOD_S, SHORTEST_PERIOD_S
 from palpate.scene.inclusions import Inclusion, SurfaceInclusion
 from palpate.scene.material import Material, PronySeries, check_constant
@@ -322,11 +323,12 @@ def load_config(path: Path) -> Config:
     Raises FileNotFoundError, or ConfigError with one line per mistake.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such configuration")
+        raise missing(path, "configuration")
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+        hint = "; a model is run with `palpate serve`" if path.suffix == ".npz" else ""
+        raise ConfigError(f"{path}: not valid TOML: {error}{hint}") from error
     return check_config(tables, str(path))
 
 

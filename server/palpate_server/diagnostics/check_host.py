@@ -26,7 +26,7 @@ import zenoh
 
 import palpate_server.session.server  # noqa: F401, it runs in a child process; a missing package is found here, at the start
 from palpate.model_file import save_model
-from palpate_client.arguments import positive_up_to
+from palpate_client.arguments import failed, positive_up_to
 from palpate_client.connection import open_session
 from palpate_client.errors import ClientError
 from palpate_client.local_server import free_endpoint, running
@@ -248,8 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         measured = [*transport_round_trip(), *tick_run(options.seconds), under_load()]
     except ClientError as error:
-        print(f"palpate check-host: {error}", file=sys.stderr)
-        return 2
+        return failed("palpate check-host", error, 2)
     except KeyboardInterrupt:
         return 130
     verdict = worst([finding.verdict for finding in measured])

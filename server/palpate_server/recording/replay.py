@@ -18,7 +18,7 @@ import os
 import struct
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from mcap.reader import NonSeekingReader
 
 from palpate.files import printable
 from palpate.model_file import ModelFileError, load_model
+from palpate_client.arguments import failed
 from palpate_client.wire import Flags
 from palpate_server.coupling import cross_fade, models
 from palpate_server.coupling.models import Model
@@ -88,6 +89,13 @@ class Comparison:
     stretches: int
     difference: str | None
     missing_models: tuple[str, ...]
+
+    @property
+    def code(self) -> int:
+        """The exit code that tells it."""
+        if self.difference is not None:
+            return 1
+        return 3 if self.ticks < self.of else 0
 
 
 def read_recording(path: Path) -> Recorded:
@@ -262,25 +270,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="palpate replay", description=about[0], epilog=about[-1])
     parser.add_argument("recording", type=Path, metavar="RECORDING.mcap")
     parser.add_argument("models", type=Path, nargs="+", metavar="MODEL.npz")
+    parser.add_argument("--json", action="store_true", help="print the comparison as JSON")
     options = parser.parse_args(arguments)
     try:
         recorded = read_recording(options.recording)
         result = compare(recorded, [load_model(path) for path in options.models])
     except (OSError, ReplayError, ModelFileError) as error:
-        print(printable(f"palpate replay: {error}"), file=sys.stderr)
-        return 2
+        return failed("palpate replay", error, 2)
+    if options.json:
+        print(json.dumps(asdict(result)))
+        return result.code
     where = "" if result.stretches == 1 else f", in {result.stretches} stretches"
     print(f"{result.ticks} of {result.of} ticks repeated{where}, {result.with_force} with a force: ", end="")
     if result.difference is not None:
         print(result.difference)
-        return 1
-    if result.ticks < result.of:
+    elif result.ticks < result.of:
         print("these are the same, bit for bit; the others could not be compared")
         if result.missing_models:
             print(printable(f"models that are needed too: {', '.join(result.missing_models)}"))
-        return 3
-    print("every one is the same, bit for bit")
-    return 0
+    else:
+        print("every one is the same, bit for bit")
+    return result.code
 
 
 if __name__ == "__main__":
