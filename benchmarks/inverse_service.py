@@ -29,6 +29,7 @@ class InverseService:
     url: where it listens.
     hand: position of the cursor, m, at a time since the start, s.
     silent: answers nothing while it is set.
+    connected, ready: of the device.
     force_n: what the device renders now.
     states: (time_ns, position) of each state that was sent; forces: (time_ns, force) of each command that came.
     errors: what was wrong about commands.
@@ -37,6 +38,7 @@ class InverseService:
     def __init__(self, hand: Callable[[float], Vector], port: int = 0) -> None:
         self.hand = hand
         self.silent = False
+        self.connected = self.ready = True
         self.force_n: Vector = (0.0, 0.0, 0.0)
         self.states: list[tuple[int, Vector]] = []
         self.forces: list[tuple[int, Vector]] = []
@@ -120,6 +122,6 @@ class InverseService:
         if full:
             device["config"] = {"handedness": "right", "port": "COM7"}
             names = ("calibrated", "in_use", "power_supply", "ready", "started")
-            device["status"] = dict.fromkeys(names, True)
+            device["status"] = dict.fromkeys(names, True) | {"ready": self.ready}
             grip["status"] = dict.fromkeys(("connected", "awake", "ready"), True)
-        return json.dumps({"inverse3": [device], "wireless_verse_grip": [grip]})
+        return json.dumps({"inverse3": [device] if self.connected else [], "wireless_verse_grip": [grip]})

@@ -20,7 +20,8 @@ os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 try:
     import pygame
 except ModuleNotFoundError:
-    sys.exit("desktop bridge: needs the package pygame: pip install 'palpate[desktop]'")
+    print("desktop bridge: needs the package pygame: pip install 'palpate[desktop]'", file=sys.stderr)
+    sys.exit(2)
 
 PIXEL_M, NOTCH_M, SPEED_M_PER_S, TRIGGER_M = 1e-4, 5e-4, 0.02, 0.01
 ABOVE_M, DEEPEST_M, ASIDE_M = 5e-3, 0.015, 0.1  # the tip stays between these

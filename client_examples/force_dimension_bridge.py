@@ -15,7 +15,11 @@ from palpate_client import DeviceLost, bridge
 try:
     from forcedimension_core import dhd
 except (ImportError, OSError) as error:  # OSError: the package is there, the SDK's library is not
-    sys.exit(f"force dimension bridge: needs forcedimension-core and the Force Dimension SDK: {error}")
+    print(
+        f"force dimension bridge: needs forcedimension-core and the Force Dimension SDK: {error}",
+        file=sys.stderr,
+    )
+    sys.exit(2)
 
 
 class ForceDimension:

@@ -23,7 +23,8 @@ try:
     from websockets.exceptions import WebSocketException
     from websockets.sync.client import connect
 except ModuleNotFoundError:
-    sys.exit("haply bridge: needs the package websockets: pip install 'palpate[haply]'")
+    print("haply bridge: needs the package websockets: pip install 'palpate[haply]'", file=sys.stderr)
+    sys.exit(2)
 
 URL = "ws://127.0.0.1:10001"
 SILENCE_S = 0.1  # the guard's patience
@@ -47,7 +48,10 @@ class Inverse3:
             raise DeviceLost(f"no Inverse service at {url}: {error}") from error
         if not first.get("inverse3"):
             raise DeviceLost(f"no Inverse3 is connected to the service at {url}")
-        self.id = first["inverse3"][0]["device_id"]
+        self.id, status = first["inverse3"][0]["device_id"], first["inverse3"][0].get("status", {})
+        for name in ("power_supply", "calibrated", "ready"):
+            if not status.get(name, True):
+                print(f"warning: the service says of the Inverse3 {self.id}: not {name}", file=sys.stderr)
         command = (sys.executable, __file__, QUIET, url, self.id)
         # In a session of its own: Ctrl-C must not end it before us.
         self.guard = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)

@@ -22,7 +22,8 @@ try:
     from pyOpenHaptics.hd_callback import hd_callback
     from pyOpenHaptics.hd_device import HapticDevice
 except (ImportError, OSError) as error:  # OSError: the package is there, OpenHaptics' library is not
-    sys.exit(f"openhaptics bridge: needs pyOpenHaptics and OpenHaptics: {error}")
+    print(f"openhaptics bridge: needs pyOpenHaptics and OpenHaptics: {error}", file=sys.stderr)
+    sys.exit(2)
 
 HOLD_S = 0.02
 SILENCE_S = 0.1

@@ -113,7 +113,7 @@ def test_without_its_package_a_bridge_says_what_it_needs(
         f"runpy.run_path({str(EXAMPLES / script)!r}, run_name='__main__')\n"
     )
     code, _, err = start(runner).finish()
-    assert code == 1
+    assert code == 2
     assert len(err.splitlines()) == 1
     assert " needs " in err
 

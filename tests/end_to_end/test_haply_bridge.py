@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from inverse_service import InverseService
 from palpate.model_file import SurfaceModel
+from palpate_client import DeviceLost
 from palpate_client.local_server import free_endpoint
 
 pytest.importorskip("websockets")
+EXAMPLES = Path(__file__).parents[2] / "client_examples"
 NO_FORCE = (0.0, 0.0, 0.0)
 START_M = (0.02, -0.11, 0.08)  # where the hand is when the bridge starts
 
@@ -166,6 +170,47 @@ def test_a_bridge_whose_service_falls_silent_ends_without_a_force(
     assert code == 1
     assert "is silent" in err
     assert service.force_n == NO_FORCE
+
+
+@pytest.fixture
+def haply() -> Any:
+    spec = importlib.util.spec_from_file_location("haply_bridge", EXAMPLES / "haply_bridge.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_device_begins_where_the_hand_is_without_a_force_and_warns_when_it_is_not_ready(
+    haply: Any, service: InverseService, capfd: pytest.CaptureFixture[str]
+) -> None:
+    service.ready = False
+    device = haply.Inverse3(service.url)
+    try:
+        assert device.neutral_m == START_M
+        assert [force for _, force in service.forces] == [NO_FORCE]
+        device.render((0.1, 0.2, 0.3))
+        assert device.read() == (START_M, (0.0, 0.0, 0.0))
+        assert service.force_n == (0.1, 0.2, 0.3)
+    finally:
+        device.close()
+    assert device.guard.returncode == 0
+    assert capfd.readouterr().err == "warning: the service says of the Inverse3 04a1: not ready\n"
+
+
+def test_a_device_that_is_not_there_or_is_unplugged_is_told(haply: Any, service: InverseService) -> None:
+    service.connected = False
+    with pytest.raises(DeviceLost, match="no Inverse3 is connected to the service at ws://"):
+        haply.Inverse3(service.url)
+    service.connected = True
+    device = haply.Inverse3(service.url)
+    try:
+        service.connected = False
+        device.render(NO_FORCE)
+        with pytest.raises(DeviceLost, match="the Inverse3 04a1 is no longer connected"):
+            device.read()
+    finally:
+        device.close()
 
 
 def test_a_service_that_is_not_there_is_told(shared: Any, run_example: Callable[..., Any]) -> None:
