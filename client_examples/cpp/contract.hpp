@@ -37,22 +37,33 @@ struct Promise {
     std::int64_t decaying = 0, stale = 0;  // bits
 };
 
-// Whether the tip may be in the tissue: only while forces come, and after a gap not before the hand has left
-// it, so that no force jumps back in. It begins closed: a hand that begins in the tissue has to leave it
-// first.
-class Gate {
+// Makes the contact with a patch model one-sided: the tip is in the tissue only while the hand is and forces come, and after a gap
+// not before the hand has left, so that no force jumps back in. It enters where the hand enters. A surface model, which is touched
+// from outside anyway, gets the hand's position as it is.
+class OneSidedContact {
  public:
-    // A force is held as long without a newer one as the server holds a silent input.
-    explicit Gate(std::int64_t hold_ns) : hold_ns_(hold_ns) {}
+    // `inwards` is a unit vector. A force is held as long without a newer one as the server holds a silent input.
+    OneSidedContact(std::int64_t hold_ns, const Vec3& inwards, bool touches_anywhere)
+        : hold_ns_(hold_ns), inwards_(inwards), touches_anywhere_(touches_anywhere) {}
 
-    bool open(std::int64_t silence_ns, bool inside) {
-        closed_ = silence_ns > hold_ns_ || (closed_ && inside);
-        return inside && !closed_;
+    // The tip's position for the hand's, m from where it touches without pressing; none while it is not in the tissue.
+    std::optional<Vec3> tip(const Vec3& hand, std::int64_t silence_ns) {
+        if (touches_anywhere_) return hand;
+        const double depth = dot(hand, inwards_);
+        let_go_ = silence_ns > hold_ns_ || (let_go_ && depth > 0);
+        if (!let_go_ && depth > 0) return hand - entered_;
+        entered_ = hand - depth * inwards_;
+        return std::nullopt;
     }
+
+    bool fresh(std::int64_t silence_ns) const { return silence_ns <= hold_ns_; }
 
  private:
     std::int64_t hold_ns_;
-    bool closed_ = true;
+    Vec3 inwards_;
+    bool touches_anywhere_;
+    bool let_go_ = true;  // a hand that begins in the tissue has to leave it first
+    Vec3 entered_{};      // where the hand went in, on the surface
 };
 
 // Round-trip times, counted by the microsecond: fixed memory, however long it runs.

@@ -71,11 +71,10 @@ class Bridge {
           tool_(connection.description().tools[tool]),
           inwards_(-1.0 * tool_.normal),
           options_(options),
-          touches_anywhere_(connection.description().touches_anywhere),
           period_ns_(std::llround(connection.description().promise.period_s * 1e9)),
-          hold_ns_(std::llround(connection.description().promise.hold_s * 1e9)),
           contract_(connection.description().promise),
-          gate_(hold_ns_) {
+          contact_(std::llround(connection.description().promise.hold_s * 1e9), inwards_,
+                   connection.description().touches_anywhere) {
         connection.receive_forces(tool);
     }
 
@@ -161,24 +160,16 @@ class Bridge {
     // Each period: the newest force to the motors, where the device is to the server.
     void step(Device& device) {
         const Vec3 position = device.position_m();
-        const double depth = dot(position, inwards_);
-        deepest_m_ = std::max(deepest_m_, depth);
-        // A surface model is touched wherever the hand is. The tip of a patch model is outside the tissue until its position
-        // is inside it; then it sticks to where it touched.
+        deepest_m_ = std::max(deepest_m_, dot(position, inwards_));
         const std::int64_t silence_ns = now_ns() - newest_.arrival_ns;
-        const bool inside = touches_anywhere_ ? silence_ns <= hold_ns_ : gate_.open(silence_ns, depth > 0);
-        if (touches_anywhere_) {
-            touched_ = Vec3{};
-        } else if (!inside) {
-            touched_ = position - depth * inwards_;
-        }
+        const auto tip = contact_.tip(position, silence_ns);
         Command command;
-        command.position_m = inside || touches_anywhere_ ? home_m_ + (position - touched_) : home_m_;
+        command.position_m = home_m_ + tip.value_or(Vec3{});
         // The velocity lets the server carry the motion on when a command is late; the tick tells it which of
         // its forces acted until now, so that it can count the energy exactly although messages take time.
-        command.velocity_m_per_s = inside ? device.velocity_m_per_s() : Vec3{};
+        command.velocity_m_per_s = tip ? device.velocity_m_per_s() : Vec3{};
         command.rendered_tick = rendered_tick_;
-        device.render(inside ? newest_.force_n : Vec3{});  // with its sign, as it comes
+        device.render(tip && contact_.fresh(silence_ns) ? newest_.force_n : Vec3{});  // with its sign, as it comes
         rendered_tick_ = newest_.tick;
         send(command);
     }
@@ -225,14 +216,12 @@ class Bridge {
     const Tool& tool_;
     const Vec3 inwards_;
     const Options& options_;
-    const bool touches_anywhere_;
-    const std::int64_t period_ns_, hold_ns_;
+    std::int64_t period_ns_;
     Deadlines deadlines_{period_ns_};
     Contract contract_;
-    Gate gate_;
+    OneSidedContact contact_;
     Force newest_;
-    Vec3 home_m_{};   // where the tip touches without pressing
-    Vec3 touched_{};  // where the tip went in, on the surface
+    Vec3 home_m_{};  // where the tip touches without pressing
     std::optional<std::int64_t> rendered_tick_;
     std::int64_t sequence_ = 0, missed_ = 0;
     double round_trip_s_ = 0.0, deepest_m_ = 0.0;

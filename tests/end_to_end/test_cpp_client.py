@@ -16,12 +16,13 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import psutil
 import pytest
 
-from palpate_client import Contract, Force
+from palpate_client import Contract, Force, OneSidedContact
 from palpate_client.messages import read_description
 from palpate_client.wire import Flags
 
@@ -39,7 +40,7 @@ PROMISE = {
     "model": {"config_sha256": "0"},
 }
 
-# Reads what is done to a contract, a gate or a queue, and prints what they say of it.
+# Reads what is done to a contract or a queue, or where a hand is, and prints what they say of it.
 LISTENER = f"""
 #include <iostream>
 #include <thread>
@@ -83,11 +84,17 @@ void check_contract() {{
     for (const auto& line : contract.broken()) std::cout << line << '\\n';
 }}
 
-void check_gate() {{
+void check_contact() {{
     std::int64_t silence_ns;
-    std::cin >> silence_ns;
-    palpate::Gate gate(silence_ns);
-    for (bool inside; std::cin >> silence_ns >> inside;) std::cout << gate.open(silence_ns, inside);
+    bool touches_anywhere;
+    std::cin >> silence_ns >> touches_anywhere;
+    palpate::OneSidedContact contact(silence_ns, {{0.0, 0.6, -0.8}}, touches_anywhere);
+    std::cout.precision(17);
+    for (palpate::Vec3 hand; std::cin >> silence_ns >> hand[0] >> hand[1] >> hand[2];) {{
+        const auto tip = contact.tip(hand, silence_ns);
+        const palpate::Vec3 at = tip.value_or(palpate::Vec3{{}});
+        std::cout << tip.has_value() << ' ' << at[0] << ' ' << at[1] << ' ' << at[2] << '\\n';
+    }}
 }}
 
 void check_queue(long count) {{
@@ -110,7 +117,7 @@ void check_queue(long count) {{
 int main(int, char** argv) {{
     const std::string what = argv[1];
     if (what == "contract") check_contract();
-    if (what == "gate") check_gate();
+    if (what == "contact") check_contact();
     if (what == "queue") check_queue(300'000);
 }}
 """
@@ -331,24 +338,32 @@ def test_a_force_that_breaks_the_contract_is_not_rendered(listen: Callable[..., 
     assert listen("contract", told).splitlines()[1] == "".join(str(may) for _, _, may in forces)
 
 
-def test_the_tip_stays_out_after_a_gap_until_the_hand_has_left_the_tissue(listen: Callable[..., str]) -> None:
-    fresh, old = 30 * MS, 30 * MS + 1
-    told = [
-        (fresh, 1, "0"),  # it begins in the tissue
-        (fresh, 0, "0"),
-        (fresh, 1, "1"),
-        (fresh, 1, "1"),
-        (old, 1, "0"),
-        (fresh, 1, "0"),
-        (fresh, 0, "0"),
-        (fresh, 1, "1"),
-        (old, 0, "0"),
-        (fresh, 1, "0"),  # it came in while nothing was known
-        (fresh, 0, "0"),
-        (fresh, 1, "1"),
+@pytest.mark.parametrize("touches_anywhere", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_tip_is_where_the_one_in_python_is(
+    listen: Callable[..., str], seed: int, touches_anywhere: bool
+) -> None:
+    """In and out of the tissue, with gaps in which the hand is let go until it leaves: tests/client/test_tool.py says why."""
+    rng = random.Random(seed)
+    tool: Any = SimpleNamespace(
+        home_m=(0.0,) * 3, normal=(0.0, -0.6, 0.8), silent_s=0.0, touches_anywhere=touches_anywhere
+    )
+    contact = OneSidedContact(tool, HOLD_NS * 1e-9)
+    told, expected = [f"{HOLD_NS} {int(touches_anywhere)}"], []
+    for i in range(200):
+        height_m = 2e-3 * math.cos(i / 5)
+        hand = [height_m * n + rng.uniform(-1e-3, 1e-3) for n in tool.normal]
+        silence_ns = rng.choice([0, 0, 0, 0, HOLD_NS - 1, HOLD_NS + 1])
+        tool.silent_s = silence_ns * 1e-9
+        tip, touches = contact.tip(hand)
+        expected.append([int(touches), *tip])
+        told.append(" ".join(map(repr, (silence_ns, *hand))))
+    said = [
+        [float(word) for word in line.split()] for line in listen("contact", "\n".join(told)).splitlines()
     ]
-    said = listen("gate", "\n".join([f"{fresh}", *(f"{silence} {inside}" for silence, inside, _ in told)]))
-    assert said == "".join(is_open for _, _, is_open in told)
+    assert said == [pytest.approx(row, abs=1e-15) for row in expected]
+    if not touches_anywhere:
+        assert {row[0] for row in expected} == {0, 1}
 
 
 def test_what_one_thread_queues_another_finds_whole_and_in_order(listen: Callable[..., str]) -> None:
