@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,3 +123,13 @@ def test_the_command_lists_all_tells_one_and_refuses_others(
     assert [entry["name"] for entry in json.loads(printed("--json"))] == list(TISSUES)
     with pytest.raises(ValueError, match="there is no tissue 'bone': expected one of paper-cube, liver"):
         printed("bone")
+
+
+def test_the_page_has_the_numbers_of_the_presets() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "tissue.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([\w-]+)` \| ([\d.]+) \| ([\d., ]+) \|", page, re.MULTILINE)
+    assert {name for name, _, _ in rows} == set(TISSUES) - {"paper-cube"}
+    for name, modulus, losses in rows:
+        preset = TISSUES[name]
+        assert modulus == f"{preset.material.youngs_modulus_pa:.4g}"
+        assert losses == ", ".join(f"{loss:.2g}" for loss in preset.loss_tangents)
