@@ -99,15 +99,19 @@ def require_memory(size: BodySize) -> None:
 _PROGRAM = 0.25 * 2**30
 """Bytes of the interpreter and the libraries."""
 
-_COPIES, _FACTORS = 6.4, 1.07
-"""Matrices of the size of the stiffness and factors that are there at the peak: from 1.09 GiB at 4,185 and 4.13 at 15,364 nodes."""
+_BESIDE = 0.45 * 2**30
+"""Bytes that the direct solvers' libraries, the cloud and the basis hold beside the matrices: from the peaks of 15,364 and
+31,648 nodes with MKL PARDISO, 2.73 and 6.36 GiB."""
+
+_UPPER_TRIANGLE = 0.35
+"""Size of the triangle that MKL PARDISO gets in blocks, over the stiffness matrix, whose indices are stored for each entry."""
 
 
 def expected_stages(size: BodySize) -> list[ExpectedStage]:
-    """In order, by what `benchmarks/organ_scale.py` has measured up to 15,364 nodes (docs/validation.md)."""
+    """In order, by what `benchmarks/organ_scale.py` has measured up to 31,648 nodes (docs/validation.md)."""
     n, support = size.n_nodes, size.support_radius
     stiffness = stiffness_memory(n, support)
-    cloud = ExpectedStage("node cloud", 1.2e-3 * n if size.on_surface else 0.0, _PROGRAM + 8e4 * n)
+    cloud = ExpectedStage("node cloud", 1.1e-3 * n if size.on_surface else 0.0, _PROGRAM + 8e4 * n)
     seconds = 1.2e-3 * n * (support / 2.2) ** 4
     assembly = ExpectedStage("assembly", seconds, _PROGRAM + max(8e4 * n, 3 * stiffness))
     if not by_ritz(n, size.symmetric):
@@ -115,9 +119,10 @@ def expected_stages(size: BodySize) -> list[ExpectedStage]:
         return [cloud, assembly, ExpectedStage("modes, all", 1e-8 * n**3, needed)]
     solver = solver_name()
     vectors = 2 * 8 * 9 * n * STEPS_EXPECTED * size.n_contacts
-    needed = _PROGRAM + _COPIES * stiffness + _FACTORS * factor_memory(n, support) + vectors
-    # The solutions with the factor, and the factor itself, grow about as its entries.
-    seconds = 35 * (n / 4185) ** 1.6 * (1 if solver == "MKL PARDISO" else 4.5)
+    matrices = (1 + _UPPER_TRIANGLE) * stiffness + factor_memory(n, support)
+    needed = _PROGRAM + _BESIDE + matrices + vectors
+    # The factor grows faster than the solutions with it, of which there are some eighty.
+    seconds = 552 * (n / 31_648) ** 1.5 * (1 if solver == "MKL PARDISO" else 1.7)
     return [cloud, assembly, ExpectedStage(f"modes, Ritz, {solver}", seconds, needed)]
 
 
