@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from palpate.geometry.cloud import NodeCloud, TriangleSurface
 from palpate.geometry.fill import fill_surface
 from palpate.geometry.refinement import refine_surface
+from palpate.geometry.region_edge import Distance
 from palpate.geometry.regions import ContactPatch, contact_patch, distance_outside, nodes_in
 from palpate.geometry.sampling import depth_inside, sample_elements
 from palpate.geometry.shapes import ball, box_lattice
@@ -18,6 +19,7 @@ from palpate.geometry.surface import load_surface
 from palpate.inclusions import finer_around_inclusions
 from palpate.model_file import ToolShape
 from palpate.progress import NO_PROGRESS, Progress
+from palpate.scene.regions import NearestRegion
 from palpate.scene.schema import (
     BallGeometry,
     BoxGeometry,
@@ -57,7 +59,15 @@ def build_cloud(config: Config, folder: Path, progress: Progress = NO_PROGRESS) 
             for note in loaded.notes:
                 progress.warn(note)
             areas = (*_working_areas(config, loaded.surface), *finer_around_inclusions(config, folder))
-            return fill_surface(loaded.surface, spacing, refinements(config), areas)
+            return fill_surface(loaded.surface, spacing, refinements(config), areas, held_part(config))
+
+
+def held_part(config: Config) -> Distance | None:
+    """How far points are outside all fixed regions that hold an area, m; None where there is none."""
+    regions = [region for region in config.fixed if not isinstance(region, NearestRegion)]
+    if not regions:
+        return None
+    return lambda points: np.min([distance_outside(region, points) for region in regions], axis=0)
 
 
 def fixed_nodes(config: Config, cloud: NodeCloud) -> Indices:

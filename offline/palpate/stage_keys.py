@@ -48,10 +48,11 @@ def stage_keys(config: Config, folder: Path) -> StageKeys:
         if table["spacing_m"] is not None
     ]
     refined: list[object] = []
+    held: list[object] = []
     if isinstance(config.geometry, SurfaceGeometry):
         refined = [p for p in patches if p[2] is not None]
     finer = [refined, shapes, scene["surface"], bool(scene["tool"])]
-    cloud = key_of(_code(_CLOUD), geometry, files, finer)
+    cloud = key_of(_code(_CLOUD), geometry, files, finer, held)
     body = key_of(
         _code(_BODY), cloud, scene["fixed"], patches, scene["discretization"], scene["inclusion"],
         config.material.material().poissons_ratio, solver_name(),

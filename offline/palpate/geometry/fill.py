@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from palpate.geometry.cloud import NodeCloud, TriangleSurface
 from palpate.geometry.measures import enclosed_volume, triangle_normals
+from palpate.geometry.placing import Placement
+from palpate.geometry.region_edge import Distance, paired_nodes, region_edge, spread_along
+from palpate.geometry.round_patch import fitted, patch_nodes
 from palpate.geometry.sampling import (
     InnerSamples,
-    Samples,
     closest_point,
     depth_inside,
     sample_elements,
@@ -31,11 +30,6 @@ Array = NDArray[np.float64]
 _PLACING, _MEASURING = 1 / 4, 1 / 8
 """Distance of samples over that of nodes, where nodes are placed and where their shares are measured."""
 
-_DISC = {1: 0.75, 2: 0.81, 3: 0.86}
-"""Distance over spacing at which points dropped at random until none fits have 1 node per spacing^dimension."""
-
-_RELAXATIONS = 12
-
 _BYTES_A_NODE = 50_000
 """Memory of the samples, 8³ a node, while the shares are measured."""
 
@@ -45,6 +39,7 @@ def fill_surface(
     spacing_m: float,
     refinements: Sequence[Refinement] = (),
     refined_areas: Sequence[RefinedArea] = (),
+    held: Distance | None = None,
     seed: int = 0,
 ) -> NodeCloud:
     """Fill the inside of a surface that `check_surface` accepts; the boundary nodes lie on it and come first.
@@ -52,6 +47,7 @@ def fill_surface(
     spacing_m    distance between nodes away from the refinements, m
     refinements  round patches with nodes closer together
     refined_areas  parts of the surface with nodes closer together
+    held         distance outside the part that is to be held: along its edge nodes lie in pairs (see `region_edge`)
     seed         of the random order in which nodes are placed; the same seed gives the same cloud
 
     Nodes are placed on round patches, corners, sharp edges, faces and inside, in this order. Each time they are
@@ -64,16 +60,16 @@ def fill_surface(
 
     Raises ValueError when the spacing doesn't suit the body or a round patch finds no place on it.
     """
-    refinements = tuple(_fitted(r, surface) for r in refinements)
+    refinements = tuple(fitted(r, surface) for r in refinements)
     field = SpacingField(spacing_m, refinements, tuple(refined_areas))
     _check_spacing(surface, field)
-    rng = np.random.default_rng(seed)
     gaps = find_gaps(surface, field)
-    boundary = _boundary_nodes(surface, field, gaps, rng)
+    placement = Placement(field, gaps, np.random.default_rng(seed))
+    boundary = _boundary_nodes(surface, placement, held)
 
     samples = sample_inside(surface, field, _PLACING)
     room = _deeper_than(0.5 * samples.spacing, samples, surface)
-    points = _place(boundary, samples, room, 3, lambda p: p, field, gaps, rng)
+    points = placement.place(boundary, samples, 3, lambda p: p, room)
     n_boundary = len(boundary)
     if len(points) == n_boundary:
         raise ValueError(
@@ -128,164 +124,32 @@ def _check_spacing(surface: TriangleSurface, field: SpacingField) -> None:
         )
 
 
-def _boundary_nodes(
-    surface: TriangleSurface, field: SpacingField, gaps: Gaps, rng: np.random.Generator
-) -> Array:
+def _boundary_nodes(surface: TriangleSurface, placement: Placement, held: Distance | None) -> Array:
     """(n_boundary, 3): patch rings, then corners, sharp edges and faces of the surface, m."""
-    vertices, triangles = surface.vertices, surface.triangles
-    nodes = _patches(surface, field)
+    vertices, triangles, field = surface.vertices, surface.triangles, placement.field
+    nodes = patch_nodes(surface, field)
     edges, corners = sharp_edges(surface)
-    nodes = np.vstack([nodes, _spread(vertices[corners], nodes, 1, field, gaps, rng)])
+    nodes = np.vstack([nodes, placement.spread(vertices[corners], nodes, 1)])
+    border = None if held is None else region_edge(surface, held, field)
+
+    def on_edges(points: Array) -> Array:
+        return closest_point(points, vertices, edges)[0]
+
+    def on_faces(points: Array) -> Array:
+        return closest_point(points, vertices, triangles)[0]
+
     if len(edges):
+        if border is not None and held is not None:
+            pairs = paired_nodes(border.on_sharp_edges, held, on_edges, field, nodes)
+            nodes = np.vstack([nodes, pairs])
         samples, _ = sample_elements(vertices, edges, field, _PLACING / 2)
-        nodes = _place(
-            nodes, samples, None, 1, lambda p: closest_point(p, vertices, edges)[0], field, gaps, rng
+        nodes = placement.place(nodes, samples, 1, on_edges)
+    if border is not None and held is not None:
+        nodes = np.vstack(
+            [nodes, paired_nodes(spread_along(border, placement), held, on_faces, field, nodes)]
         )
     samples, _ = sample_elements(vertices, triangles, field, _PLACING)
-    return _place(
-        nodes, samples, None, 2, lambda p: closest_point(p, vertices, triangles)[0], field, gaps, rng
-    )
-
-
-def _place(
-    fixed: Array,
-    samples: Samples,
-    room: NDArray[np.bool_] | None,
-    dimension: int,
-    project: Callable[[Array], Array],
-    field: SpacingField,
-    gaps: Gaps,
-    rng: np.random.Generator,
-) -> Array:
-    """The fixed nodes and, after them, new ones spread among the samples (those with room, if given) and relaxed."""
-    candidates = samples.points if room is None else samples.points[room]
-    free = _spread(candidates, fixed, dimension, field, gaps, rng)
-    sight = gaps.sight(samples.points)
-    weights = samples.measures / samples.spacing ** (dimension + 2)
-    for _ in range(_RELAXATIONS):
-        nodes = np.vstack([fixed, free])
-        owner = nearest_node(nodes, samples.points, sight)
-        mass = np.bincount(owner, weights, minlength=len(nodes))[len(fixed) :]
-        moment = np.column_stack(
-            [np.bincount(owner, weights * x, minlength=len(nodes))[len(fixed) :] for x in samples.points.T]
-        )
-        free = project(np.where(mass[:, None] > 0, moment / np.where(mass > 0, mass, 1.0)[:, None], free))
-    return np.vstack([fixed, free])
-
-
-def _spread(
-    candidates: Array,
-    fixed: Array,
-    dimension: int,
-    field: SpacingField,
-    gaps: Gaps,
-    rng: np.random.Generator,
-) -> Array:
-    """The candidates in random order, less those within the disc of a fixed node or of one taken before, (n, 3).
-
-    A disc ends at a gap.
-    """
-    if not len(candidates):
-        return candidates
-    tree = cKDTree(candidates)
-    points = np.vstack([candidates, fixed])
-    beside, eyes = gaps.beside(points), gaps.eyes(points)
-    radii = _DISC[dimension] * field(points)
-    alive = np.ones(len(candidates), dtype=bool)
-
-    def clear_disc(i: int) -> None:
-        near = np.array(tree.query_ball_point(points[i], radii[i]), dtype=np.intp)
-        if beside[i]:
-            near = near[~gaps.hidden(np.tile(eyes[i], (len(near), 1)), eyes[near])]
-        alive[near] = False
-
-    for i in range(len(candidates), len(points)):
-        clear_disc(i)
-    taken = []
-    for i in rng.permutation(len(candidates)):
-        if alive[i]:
-            taken.append(i)
-            clear_disc(i)
-            alive[i] = False
-    return candidates[taken]
-
-
-def _fitted(patch: Refinement, surface: TriangleSurface) -> Refinement:
-    """The patch moved to the surface point nearest to its center, its spacing (reduced) such that its rings fit."""
-    closest, _ = closest_point(np.array([patch.center_m]), surface.vertices, surface.triangles)
-    x, y, z = closest[0].tolist()
-    spacing = patch.radius_m / (_n_rings(patch) + 0.5)
-    return replace(patch, center_m=(x, y, z), spacing_m=spacing)
-
-
-def _n_rings(patch: Refinement) -> int:
-    """The fewest rings within a patch, at spacing s, 2 s, ..., with radius = (n_rings + 1/2) s and s <= spacing."""
-    return max(1, math.ceil(patch.radius_m / patch.spacing_m - 0.5 - 1e-9))
-
-
-def _patches(surface: TriangleSurface, field: SpacingField) -> Array:
-    """(n, 3), nodes of the round patches, m."""
-    if not field.refinements:
-        return np.empty((0, 3))
-    patches = [_rings(surface, r) for r in field.refinements]
-    for patch, nodes in zip(field.refinements, patches, strict=True):
-        _refuse_folded(patch, nodes)
-    nodes = np.vstack(patches)
-    owner = np.repeat(np.arange(len(patches)), [len(p) for p in patches])
-    nearest = 0.5 * min(r.spacing_m for r in field.refinements)
-    for a, b in sorted(cKDTree(nodes).query_pairs(nearest)):
-        if owner[a] != owner[b]:
-            raise ValueError(
-                f"two round patches overlap near {nodes[a].tolist()} m: expected them at least two spacings apart"
-            )
-    return nodes
-
-
-def _refuse_folded(patch: Refinement, nodes: Array) -> None:
-    """Raise ValueError where the surface folds so sharply that the patch's own nodes (n, 3) come too close."""
-    pairs = cKDTree(nodes).query_pairs(0.5 * patch.spacing_m, output_type="ndarray")
-    if len(pairs):
-        a, b = nodes[pairs[0]]
-        raise ValueError(
-            f"the surface around {list(patch.center_m)} m is too sharp or too thin for a round patch of radius "
-            f"{patch.radius_m:g} m: its nodes, {patch.spacing_m:.3g} m apart along the surface, come within "
-            f"{np.linalg.norm(a - b):.2g} m of each other near {a.round(6).tolist()} m. Expected a place that is nearly flat "
-            "over the patch, a smaller radius, or no finer spacing there (leave out the contact's spacing_m)"
-        )
-
-
-def _rings(surface: TriangleSurface, patch: Refinement) -> Array:
-    """(n, 3): a fitted patch's center, its rings, and one ring beyond its radius, with 6 k nodes on ring k, m.
-
-    A ring's nodes are the points of the surface at its distance from the center, found by going back and forth
-    between sphere and surface.
-    """
-    vertices, triangles = surface.vertices, surface.triangles
-    center = np.array([patch.center_m])
-    _, triangle = closest_point(center, vertices, triangles)
-    normal = triangle_normals(surface)[0][triangle[0]]
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    first /= np.linalg.norm(first)
-    second = np.cross(normal, first)
-    nodes = [center]
-    for k in range(1, _n_rings(patch) + 2):
-        radius = k * patch.spacing_m
-        angle = 2 * np.pi * (np.arange(6 * k) + 0.5 * (k % 2)) / (6 * k)
-        ring = center + radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
-        for _ in range(100):
-            ring, _ = closest_point(ring, vertices, triangles)
-            arm = ring - center
-            distance = np.linalg.norm(arm, axis=1, keepdims=True)
-            if np.all(np.abs(distance - radius) <= 1e-9 * radius):
-                break
-            ring = center + arm * (radius / np.where(distance > 0, distance, 1.0))
-        else:
-            raise ValueError(
-                f"a round patch of radius {patch.radius_m} m finds no place around {center[0].tolist()} m: "
-                "expected a smaller radius, or a place where the surface is larger and smoother"
-            )
-        nodes.append(ring)
-    return np.vstack(nodes)
+    return placement.place(nodes, samples, 2, on_faces)
 
 
 def _areas_and_normals(

@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.geometry.cloud import NodeCloud
+from palpate.geometry.region_edge import ON_EDGE
 from palpate.geometry.sampling import closest_point
 from palpate.scene.regions import AreaRegion, BoxRegion, NearestRegion, PlaneRegion, Region, SphereRegion
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Vector = tuple[float, float, float]
-
-_EDGE = 1e-6
-"""Nodes on the edge of a region belong to it: slack as a fraction of the node's spacing."""
 
 
 class RegionError(ValueError):
@@ -50,7 +48,7 @@ def nodes_in(region: Region, cloud: NodeCloud) -> Indices:
         distance = np.linalg.norm(points - np.asarray(region.point_m), axis=1)
         return boundary[[np.argmin(distance)]]
     outside = distance_outside(region, points)
-    chosen = boundary[outside <= _EDGE * cloud.spacing[boundary]]
+    chosen = boundary[outside <= ON_EDGE * cloud.spacing[boundary]]
     if len(chosen) == 0:
         where = points[np.argmin(outside)]
         low, high = cloud.surface.vertices.min(axis=0), cloud.surface.vertices.max(axis=0)
@@ -75,7 +73,7 @@ def contact_patch(point_m: Vector, radius_m: float, cloud: NodeCloud) -> Contact
     facing = cloud.normals @ np.cross(b - a, c - a) > 0  # false inside, where normals are zero
     candidates = np.flatnonzero(facing)
     distance = np.linalg.norm(cloud.points[candidates] - center, axis=1)
-    nodes = candidates[distance <= radius_m + _EDGE * cloud.spacing[candidates]]
+    nodes = candidates[distance <= radius_m + ON_EDGE * cloud.spacing[candidates]]
     if len(nodes) == 0:
         nearest = f"{distance.min():.4g} m from its center" if len(candidates) else "nowhere"
         raise RegionError(
@@ -87,11 +85,11 @@ def contact_patch(point_m: Vector, radius_m: float, cloud: NodeCloud) -> Contact
 
 
 def distance_outside(region: AreaRegion, points: Array) -> Array:
-    """How far points (n, 3) lie outside the region, m, (n,); 0 or less within it."""
+    """How far points (n, 3) lie outside the region, m, (n,); within it the distance to its edge, negative."""
     match region:
         case BoxRegion():
-            low, high = np.asarray(region.lower_m), np.asarray(region.upper_m)
-            return np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=1)
+            beyond = np.maximum(np.asarray(region.lower_m) - points, points - np.asarray(region.upper_m))
+            return np.linalg.norm(np.maximum(0.0, beyond), axis=1) + np.minimum(0.0, beyond.max(axis=1))
         case SphereRegion():
             return np.linalg.norm(points - np.asarray(region.center_m), axis=1) - region.radius_m
         case PlaneRegion():
