@@ -60,8 +60,8 @@ class Inverse3:
 
     def render(self, force_n):
         try:
-            os.write(self.guard.stdin.fileno(), BEAT)
             self.socket.send(force_command(self.id, force_n))
+            os.write(self.guard.stdin.fileno(), BEAT)
         except BrokenPipeError as error:
             raise DeviceLost("the guard has ended, which would let go of the device for us") from error
         except WebSocketException as error:

@@ -213,6 +213,20 @@ def test_a_device_that_is_not_there_or_is_unplugged_is_told(haply: Any, service:
         device.close()
 
 
+def test_without_its_guard_a_bridge_ends_and_can_still_let_go(haply: Any, service: InverseService) -> None:
+    device = haply.Inverse3(service.url)
+    try:
+        device.guard.kill()
+        device.guard.wait()
+        for force in ((0.0, 0.0, 1.0), NO_FORCE):
+            with pytest.raises(DeviceLost, match="the guard has ended"):
+                device.render(force)
+            assert device.read() == (START_M, (0.0, 0.0, 0.0))  # the command has been taken
+            assert service.force_n == force
+    finally:
+        device.close()
+
+
 def test_a_service_that_is_not_there_is_told(shared: Any, run_example: Callable[..., Any]) -> None:
     nowhere = free_endpoint().replace("tcp/", "ws://")
     code, _, err = run_example("haply_bridge.py", shared.endpoint, "--service", nowhere).finish()
