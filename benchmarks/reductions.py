@@ -74,6 +74,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 CONFIGS = Path(__file__).parents[1] / "configs"
+PATCH_SPACING_M = 0.0018
 DIRECT_HZ = (5.0, 15.0, 29.0)
 SAMPLING = Sampling(1e-3, "bilinear", (0.0, 30.0))
 BAND_END = 2 * np.pi * SAMPLING.band_hz[1]
@@ -115,6 +116,7 @@ def prepare(spacing_mm: float, path: Path, direct: bool) -> dict[str, Any]:
     """Build the body, store it for the contenders, and return what the heading says about it."""
     scene = tomllib.loads((CONFIGS / "liver.toml").read_text(encoding="utf-8"))
     scene["geometry"]["spacing_m"] = spacing_mm / 1000
+    scene["contact"][0]["spacing_m"] = PATCH_SPACING_M
     config = Config.model_validate(scene)
     start = time.process_time()
     full = build_full_model(config, CONFIGS)
