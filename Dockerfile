@@ -11,7 +11,7 @@ RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheel . \
     && /opt/palpate/bin/pip install --no-cache-dir --constraint constraints.txt "$(ls /wheel/*.whl)[recorder,metrics]"
 
 # `docker build --target build -t palpate-build .`: builds models. Mount a folder with scenes at /models, for example
-# `docker run --rm --user "$(id -u)" -v "$PWD:/models" palpate-build build configs/liver.toml -o liver.npz`.
+# `docker run --rm --user "$(id -u)" -v "$PWD:/models" palpate-build build configs/liver-coarse.toml -o liver.npz`.
 FROM wheel AS build
 RUN /opt/palpate/bin/pip install --no-cache-dir --constraint constraints.txt "$(ls /wheel/*.whl)[build]"
 ENV PATH=/opt/palpate/bin:$PATH \

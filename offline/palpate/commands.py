@@ -322,7 +322,7 @@ def demo() -> None:
             from palpate.demo import run_demo
             from palpate.report import accuracy_text
 
-        scene = Path(str(files("palpate_configs") / "liver.toml"))
+        scene = Path(str(files("palpate_configs") / "liver-coarse.toml"))
         summary = run_demo(scene, options.out, options.seconds, stages)
     print(accuracy_text(summary.model, options.verbose), *summary.lines(), sep="\n")
 

@@ -1,6 +1,6 @@
 """Which reduction to use: in-band and static force error of all four methods against their order.
 
-    python -m palpate_paper.error_against_order configs/liver.toml --out docs/images/liver_error_against_order
+    python -m palpate_paper.error_against_order configs/liver-coarse.toml --out docs/images/liver_error_against_order
 
 writes OUT.csv and OUT.png.
 """

@@ -76,7 +76,7 @@ def test_the_bonded_punch_converges_as_spacing_and_grading_are_refined_together(
 @pytest.mark.slow
 def test_the_livers_tip_stiffness_changes_by_less_than_five_percent_when_the_spacing_there_is_halved():
     folder = Path(__file__).parents[2] / "configs"
-    config = load_config(folder / "liver.toml")
+    config = load_config(folder / "liver-coarse.toml")
     (tip,) = config.contact
     stiffness = []
     for spacing in (tip.spacing_m, tip.spacing_m / 2):

@@ -14,7 +14,7 @@ it. It has two weaknesses, and each pole is treated for them:
   theta <= 1 that lets it decay as fast as in continuous time, and beyond half the sampling rate by a factor of at least
   0.8 a sample. The rule maps |z| >= 1 into Re s >= 0 for every theta in 0..1, as the trapezoidal rule (theta = 1) does.
 
-Measured on configs/liver.toml at 1 kHz (61 N/m at rest, 4.1 kN/m instantly), largest force error in 0-30 Hz: the
+Measured on configs/liver-coarse.toml at 1 kHz (61 N/m at rest, 4.1 kN/m instantly), largest force error in 0-30 Hz: the
 unreduced model 6.2 % by the hold, 0.76 % by the plain trapezoidal rule; order 120 (0.62 % before sampling) 5.3 and 0.75 %.
 `docs/validation.md` has all figures. By the trapezoidal rule the unreduced model is passive up to half the sampling rate,
 by the hold up to 298 Hz.

@@ -96,7 +96,9 @@ def test_the_collocated_cube_reduces_to_stable_models_inside_the_bound():
 def liver(**changes):
     """The shipped scene, with entries of its tables replaced: {"table__key": value}, or whole tables."""
     folder = Path(__file__).parents[3] / "configs"
-    tables = load_config(folder / "liver.toml").model_dump(mode="json", exclude_none=True, exclude_unset=True)
+    tables = load_config(folder / "liver-coarse.toml").model_dump(
+        mode="json", exclude_none=True, exclude_unset=True
+    )
     for key, value in changes.items():
         table, _, entry = key.partition("__")
         if not entry:

@@ -50,7 +50,9 @@ def test_a_usual_scene_says_nothing() -> None:
     assert warnings() == ()
 
 
-@pytest.mark.parametrize(("scene", "size_m"), [("liver.toml", 0.206), ("cube.toml", 1.0)])
+@pytest.mark.parametrize(
+    ("scene", "size_m"), [("liver.toml", 0.206), ("liver-coarse.toml", 0.206), ("cube.toml", 1.0)]
+)
 def test_the_shipped_scenes_say_nothing(scene: str, size_m: float) -> None:
     assert plausibility(load_config(CONFIGS / scene), size_m) == ()
 
