@@ -55,6 +55,7 @@ ROOMS = (
     "geometry",
     "inclusions",
     "scene_cloud",
+    "thin_parts",
     "factorization",
     "meshfree",
     "discretization",

@@ -38,6 +38,7 @@ from palpate.scene.schema import Config, ReductionTable, canonical_text, fingerp
 from palpate.scene_cloud import build_cloud, contact_patches, fixed_nodes, shown_surface
 from palpate.stage_cache import NO_CACHE, StageCache
 from palpate.stage_keys import StageKeys, stage_keys
+from palpate.thin_parts import thin_patch
 
 Array = NDArray[np.float64]
 
@@ -142,6 +143,9 @@ def build_full_model(
         f"{cloud.n_nodes:,} nodes, {int(cloud.boundary.sum()):,} on the surface, {len(fixed)} fixed, "
         f"{' + '.join(str(len(p.nodes)) for p in patches)} in contact"
     )
+    for table, patch in zip(config.contact, patches, strict=True):
+        if text := thin_patch(table.name, patch, cloud):
+            progress.warn(text)
 
     progress(f"assembly, {config.discretization.method}")
     assemble = _ASSEMBLE[config.discretization.method]

@@ -38,6 +38,7 @@ from palpate.surface_model.footprint import (
 from palpate.surface_model.mode_count import Sample, enough_modes, guessed_modes, sample_footprints
 from palpate.surface_model.residual import residual, residual_memory
 from palpate.surface_model.rounding import rounded
+from palpate.thin_parts import thin_working_area
 
 Array = NDArray[np.float64]
 
@@ -97,6 +98,8 @@ def build_surface_model(config: Config, folder: Path, progress: Progress = NO_PR
     progress("assembly, conservative")
     body = conservative.assemble(cloud, material, fixed, [], support)
     touched = _touched(config, cloud, fixed, body.basis.value)
+    if text := thin_working_area(config, cloud, touched.nodes[touched.working]):
+        progress.warn(text)
     n_rows, n_solves = body.stiffness.shape[0], int(_SURFACE_SOLVES * guess) + 3 * len(touched.nodes)
     progress(f"factor, {solver_name(n_rows, n_solves)}")
     progress.note(f"memory needed about {needed / 2**30:.1f} GiB")

@@ -14,12 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from palpate.geometry.measures import enclosed_volume
 from palpate.geometry.surface import SurfaceError, load_surface
 from palpate.scene.plausibility import plausibility
 from palpate.scene.schema import load_config
-from palpate.scene_cloud import build_cloud
+from palpate.scene_cloud import build_cloud, contact_patches, fixed_nodes
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
 ELLIPSOID_M3 = enclosed_volume(load_surface(CASES / "good-ellipsoid.stl", "mm").surface)
@@ -150,6 +151,18 @@ def test_fixed_plane_outside(tmp_path: Path) -> None:
 
 
 def test_sharp_rim(tmp_path: Path) -> None:
-    message = refused_scene("scene-sharp-rim.toml", tmp_path)
-    assert "too sharp or too thin for a round patch of radius 0.006 m" in message
-    assert "overlap" not in message
+    """A patch on a rim holds nodes of both of its sides, none closer to another than nodes are elsewhere."""
+    config = load_config(CASES / "scene-sharp-rim.toml")
+    cloud = build_cloud(config, CASES)
+    (patch,) = contact_patches(config, cloud, fixed_nodes(config, cloud))
+    sides = cloud.normals[patch.nodes, 2]
+    assert sides.max() > 0.3
+    assert sides.min() < -0.3
+    np.testing.assert_allclose(patch.center_m, (0.06, 0, 0), atol=1e-6)
+    np.testing.assert_allclose(patch.normal, (1, 0, 0), atol=0.2)
+    nearest = cKDTree(cloud.points).query(cloud.points[patch.nodes], k=2)[0][:, 1]
+    assert np.all(nearest > 0.5 * cloud.spacing[patch.nodes])
+    shutil.copy(CASES / "geo-sharp-rim.stl", tmp_path)
+    shutil.copy(CASES / "scene-sharp-rim.toml", tmp_path)
+    done = build(tmp_path / "scene-sharp-rim.toml")
+    assert done.returncode == 0, done.stderr

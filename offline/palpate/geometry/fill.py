@@ -11,7 +11,7 @@ from palpate.geometry.cloud import NodeCloud, TriangleSurface
 from palpate.geometry.measures import enclosed_volume, triangle_normals
 from palpate.geometry.placing import Placement
 from palpate.geometry.region_edge import Distance, paired_nodes, region_edge, spread_along
-from palpate.geometry.round_patch import fitted, patch_nodes
+from palpate.geometry.round_patch import MIDWAY, fitted, patch_nodes
 from palpate.geometry.sampling import (
     InnerSamples,
     closest_point,
@@ -125,12 +125,16 @@ def _check_spacing(surface: TriangleSurface, field: SpacingField) -> None:
 
 
 def _boundary_nodes(surface: TriangleSurface, placement: Placement, held: Distance | None) -> Array:
-    """(n_boundary, 3): patch rings, then corners, sharp edges and faces of the surface, m."""
+    """(n_boundary, 3): round patches, then corners, sharp edges and faces of the surface, m.
+
+    On sharp edges and on faces the pairs along the edges of the held part and of folded patches come first.
+    """
     vertices, triangles, field = surface.vertices, surface.triangles, placement.field
-    nodes = patch_nodes(surface, field)
+    patches = patch_nodes(surface, field.refinements)
+    borders = [] if held is None else [region_edge(surface, held, field)]
+    borders += [region_edge(surface, p.distance_outside, field, MIDWAY) for p in patches.folded]
     edges, corners = sharp_edges(surface)
-    nodes = np.vstack([nodes, placement.spread(vertices[corners], nodes, 1)])
-    border = None if held is None else region_edge(surface, held, field)
+    nodes = np.vstack([patches.nodes, placement.spread(vertices[corners], patches.nodes, 1)])
 
     def on_edges(points: Array) -> Array:
         return closest_point(points, vertices, edges)[0]
@@ -139,15 +143,14 @@ def _boundary_nodes(surface: TriangleSurface, placement: Placement, held: Distan
         return closest_point(points, vertices, triangles)[0]
 
     if len(edges):
-        if border is not None and held is not None:
-            pairs = paired_nodes(border.on_sharp_edges, held, on_edges, field, nodes)
+        for border in borders:
+            pairs = paired_nodes(border, border.on_sharp_edges, on_edges, field, nodes)
             nodes = np.vstack([nodes, pairs])
         samples, _ = sample_elements(vertices, edges, field, _PLACING / 2)
         nodes = placement.place(nodes, samples, 1, on_edges)
-    if border is not None and held is not None:
-        nodes = np.vstack(
-            [nodes, paired_nodes(spread_along(border, placement), held, on_faces, field, nodes)]
-        )
+    for border in borders:
+        pairs = paired_nodes(border, spread_along(border, placement), on_faces, field, nodes)
+        nodes = np.vstack([nodes, pairs])
     samples, _ = sample_elements(vertices, triangles, field, _PLACING)
     return placement.place(nodes, samples, 2, on_faces)
 

@@ -58,29 +58,35 @@ class Crossings:
 class RegionEdge:
     """The curve on the surface where a region ends.
 
+    outside   how far points are outside the region
+    inside    distance from the edge of the nodes within, in spacings; the others are a spacing further out
     points    (n_points, 3), m
     segments  (n_segments, 2), indices of points
     outward   (n_segments, 3), unit vectors in the surface, across the segment and out of the region
     on_sharp_edges  where it crosses the surface's sharp edges
     """
 
+    outside: Distance
+    inside: float
     points: Array
     segments: Indices
     outward: Array
     on_sharp_edges: Crossings
 
 
-def region_edge(surface: TriangleSurface, outside: Distance, field: SpacingField) -> RegionEdge:
+def region_edge(
+    surface: TriangleSurface, outside: Distance, field: SpacingField, inside: float = INSIDE
+) -> RegionEdge:
     """The edge of a region on a surface; it has no segments where the region holds all of it or nothing."""
     fine = refine_surface(surface, lambda p: np.maximum(2 * np.abs(outside(p)), _FINENESS * field(p)))
     vertices, triangles = fine.vertices, fine.triangles.astype(np.int64)
     value = outside(vertices) - ON_EDGE * field(vertices)
     within = value <= 0
-    inside = within[triangles]
-    crossed = inside.any(axis=1) & ~inside.all(axis=1)
-    triangles, inside = triangles[crossed], inside[crossed]
+    sides_of = within[triangles]
+    crossed = sides_of.any(axis=1) & ~sides_of.all(axis=1)
+    triangles, sides_of = triangles[crossed], sides_of[crossed]
     # One corner of a crossed triangle is alone on its side: the edge crosses the two sides that meet there.
-    alone = np.where(inside.sum(axis=1) == 1, np.argmax(inside, axis=1), np.argmin(inside, axis=1))
+    alone = np.where(sides_of.sum(axis=1) == 1, np.argmax(sides_of, axis=1), np.argmin(sides_of, axis=1))
     turned = np.take_along_axis(triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)
     sides = np.sort(turned[:, [[0, 1], [0, 2]]].reshape(-1, 2), axis=1)
     unique, which = np.unique(sides, axis=0, return_inverse=True)
@@ -94,7 +100,7 @@ def region_edge(surface: TriangleSurface, outside: Distance, field: SpacingField
     away = np.where(within[turned[:, 0]], 1.0, -1.0) * np.einsum("si,si->s", across, (b + c) / 2 - a)
     kept = (size > 0) & (length > ON_EDGE * field(a))
     outward = (across * np.sign(away)[:, None])[kept] / size[kept, None]
-    return RegionEdge(points, segments[kept], outward, _on_sharp_edges(fine, value))
+    return RegionEdge(outside, inside, points, segments[kept], outward, _on_sharp_edges(fine, value))
 
 
 def _on_sharp_edges(fine: TriangleSurface, value: Array) -> Crossings:
@@ -131,21 +137,21 @@ def spread_along(edge: RegionEdge, placement: Placement) -> Crossings:
 
 
 def paired_nodes(
-    at: Crossings, outside: Distance, project: Callable[[Array], Array], field: SpacingField, taken: Array
+    edge: RegionEdge, at: Crossings, project: Callable[[Array], Array], field: SpacingField, taken: Array
 ) -> Array:
-    """(2 n_pairs, 3), m: pairs of nodes across the region's edge, none close to nodes taken (n, 3) or to another pair.
+    """(2 n_pairs, 3), m: pairs of nodes across the edge at some of its points, none close to another pair or nodes taken (n, 3).
 
     project  from points (n, 3), m, to the nearest of the line or surface on which the nodes lie
     """
     if not len(at.points):
         return np.empty((0, 3))
     spacing = field(at.points)
-    arms = np.array([-INSIDE, 1 - INSIDE])[:, None, None] * spacing[:, None] * at.outward
+    arms = np.array([-edge.inside, 1 - edge.inside])[:, None, None] * spacing[:, None] * at.outward
     aimed = (at.points + arms).reshape(-1, 3)
     nodes = project(aimed)
     astray = np.linalg.norm(nodes - aimed, axis=1).reshape(2, -1) > _ASTRAY * spacing
     inner, outer = nodes.reshape(2, -1, 3)
-    good = ~astray.any(axis=0) & (outside(inner) < 0) & (outside(outer) > 0)
+    good = ~astray.any(axis=0) & (edge.outside(inner) < 0) & (edge.outside(outer) > 0)
     if len(taken):
         tree = cKDTree(taken)
         for side in (inner, outer):

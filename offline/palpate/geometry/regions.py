@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.region_edge import ON_EDGE
-from palpate.geometry.sampling import closest_point
+from palpate.geometry.sampling import place_on
 from palpate.scene.regions import AreaRegion, BoxRegion, NearestRegion, PlaneRegion, Region, SphereRegion
 
 Array = NDArray[np.float64]
@@ -64,13 +64,11 @@ def contact_patch(point_m: Vector, radius_m: float, cloud: NodeCloud) -> Contact
     """Boundary nodes no further than `radius_m` from the surface point nearest to `point_m`.
 
     Nodes whose outward normal is at 90 degrees or more to the surface's there are left out: they belong to the
-    far side of a thin part. Raises RegionError when no node is left.
+    far side of a thin part. On an edge or a vertex the surface's normal is the mean over what meets there, weighted with
+    the angles, so a patch on a rim holds both of its sides. Raises RegionError when no node is left.
     """
-    vertices, triangles = cloud.surface.vertices, cloud.surface.triangles
-    closest, triangle = closest_point(np.array([point_m], dtype=float), vertices, triangles)
-    center = closest[0]
-    a, b, c = vertices[triangles[triangle[0]]]
-    facing = cloud.normals @ np.cross(b - a, c - a) > 0  # false inside, where normals are zero
+    center, normal_there = place_on(cloud.surface, point_m)
+    facing = cloud.normals @ normal_there > 0  # false inside, where normals are zero
     candidates = np.flatnonzero(facing)
     distance = np.linalg.norm(cloud.points[candidates] - center, axis=1)
     nodes = candidates[distance <= radius_m + ON_EDGE * cloud.spacing[candidates]]

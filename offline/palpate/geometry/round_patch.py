@@ -1,9 +1,10 @@
-"""The nodes of round patches: a center and rings around it."""
+"""The nodes of round patches: a center and, where the surface is nearly flat, rings around it."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +13,12 @@ from scipy.spatial import cKDTree
 from palpate.geometry.cloud import TriangleSurface
 from palpate.geometry.measures import triangle_normals
 from palpate.geometry.sampling import closest_point
-from palpate.geometry.spacing import Refinement, SpacingField
+from palpate.geometry.spacing import Refinement
 
 Array = NDArray[np.float64]
+
+MIDWAY = 0.5
+"""Where the circle of a patch's radius runs between the nodes within and those beyond it, in spacings."""
 
 
 def fitted(patch: Refinement, surface: TriangleSurface) -> Refinement:
@@ -30,42 +34,58 @@ def _n_rings(patch: Refinement) -> int:
     return max(1, math.ceil(patch.radius_m / patch.spacing_m - 0.5 - 1e-9))
 
 
-def patch_nodes(surface: TriangleSurface, field: SpacingField) -> Array:
-    """(n, 3), nodes of the round patches, m."""
-    if not field.refinements:
-        return np.empty((0, 3))
-    patches = [_rings(surface, r) for r in field.refinements]
-    for patch, nodes in zip(field.refinements, patches, strict=True):
-        _refuse_folded(patch, nodes)
-    nodes = np.vstack(patches)
-    owner = np.repeat(np.arange(len(patches)), [len(p) for p in patches])
-    nearest = 0.5 * min(r.spacing_m for r in field.refinements)
-    for a, b in sorted(cKDTree(nodes).query_pairs(nearest)):
+@dataclass(frozen=True)
+class PatchNodes:
+    """The nodes with which a cloud's round patches begin.
+
+    nodes   (n, 3), m: of a patch on a place that is nearly flat its center and rings, of any other its center
+    folded  the others, such as patches on a rim or a tip: the circle at their radius is an edge that nodes lie along
+    """
+
+    nodes: Array
+    folded: tuple[Refinement, ...]
+
+
+def patch_nodes(surface: TriangleSurface, patches: Sequence[Refinement]) -> PatchNodes:
+    """Raises ValueError where two of the fitted patches overlap, or one is larger than the body."""
+    if not patches:
+        return PatchNodes(np.empty((0, 3)), ())
+    placed, folded = [], []
+    for patch in patches:
+        nodes = _rings(surface, patch)
+        if nodes is None or len(cKDTree(nodes).query_pairs(0.5 * patch.spacing_m)):
+            _refuse_too_large(surface, patch)
+            folded.append(patch)
+            nodes = np.array([patch.center_m])
+        placed.append(nodes)
+    _refuse_overlap(patches, placed)
+    return PatchNodes(np.vstack(placed), tuple(folded))
+
+
+def _refuse_overlap(patches: Sequence[Refinement], nodes: Sequence[Array]) -> None:
+    owner = np.repeat(np.arange(len(patches)), [len(p) for p in nodes])
+    points = np.vstack(nodes)
+    for a, b in sorted(cKDTree(points).query_pairs(0.5 * min(p.spacing_m for p in patches))):
         if owner[a] != owner[b]:
             raise ValueError(
-                f"two round patches overlap near {nodes[a].tolist()} m: expected them at least two spacings apart"
+                f"two round patches overlap near {points[a].tolist()} m: expected them at least two spacings apart"
             )
-    return nodes
 
 
-def _refuse_folded(patch: Refinement, nodes: Array) -> None:
-    """Raise ValueError where the surface folds so sharply that the patch's own nodes (n, 3) come too close."""
-    pairs = cKDTree(nodes).query_pairs(0.5 * patch.spacing_m, output_type="ndarray")
-    if len(pairs):
-        a, b = nodes[pairs[0]]
+def _refuse_too_large(surface: TriangleSurface, patch: Refinement) -> None:
+    farthest = float(np.linalg.norm(surface.vertices - np.asarray(patch.center_m), axis=1).max())
+    if farthest < patch.radius_m + patch.spacing_m:
         raise ValueError(
-            f"the surface around {list(patch.center_m)} m is too sharp or too thin for a round patch of radius "
-            f"{patch.radius_m:g} m: its nodes, {patch.spacing_m:.3g} m apart along the surface, come within "
-            f"{np.linalg.norm(a - b):.2g} m of each other near {a.round(6).tolist()} m. Expected a place that is nearly flat "
-            "over the patch, a smaller radius, or no finer spacing there (leave out the contact's spacing_m)"
+            f"a round patch of radius {patch.radius_m} m finds no place around {list(patch.center_m)} m: the body ends "
+            f"{farthest:.3g} m from there, expected a smaller radius"
         )
 
 
-def _rings(surface: TriangleSurface, patch: Refinement) -> Array:
+def _rings(surface: TriangleSurface, patch: Refinement) -> Array | None:
     """(n, 3): a fitted patch's center, its rings, and one ring beyond its radius, with 6 k nodes on ring k, m.
 
     A ring's nodes are the points of the surface at its distance from the center, found by going back and forth
-    between sphere and surface.
+    between sphere and surface; None where that does not find them.
     """
     vertices, triangles = surface.vertices, surface.triangles
     center = np.array([patch.center_m])
@@ -87,9 +107,6 @@ def _rings(surface: TriangleSurface, patch: Refinement) -> Array:
                 break
             ring = center + arm * (radius / np.where(distance > 0, distance, 1.0))
         else:
-            raise ValueError(
-                f"a round patch of radius {patch.radius_m} m finds no place around {center[0].tolist()} m: "
-                "expected a smaller radius, or a place where the surface is larger and smoother"
-            )
+            return None
         nodes.append(ring)
     return np.vstack(nodes)

@@ -66,6 +66,18 @@ def depth_inside(points: Array, surface: TriangleSurface) -> Array:
     return -distance
 
 
+def place_on(surface: TriangleSurface, point: tuple[float, float, float]) -> tuple[Array, Array]:
+    """The surface point (3,), m, nearest to a point, m, and the outward normal (3,) there: on an edge or a vertex the mean over
+    the triangles that meet there, weighted with their angles (Baerentzen & Aanaes 2005)."""
+    *_, closest, normals = igl.signed_distance(
+        np.array([point], dtype=float),
+        surface.vertices,
+        surface.triangles.astype(np.int64),
+        igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
+    )
+    return closest[0], normals[0]
+
+
 def sample_elements(
     vertices: Array, elements: Indices, field: Callable[[Array], Array], fineness: float
 ) -> tuple[Samples, Indices]:

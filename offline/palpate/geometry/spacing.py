@@ -32,6 +32,10 @@ class Refinement:
     spacing_m: float
     growth: float = 0.3
 
+    def distance_outside(self, points: Array) -> Array:
+        """(n,), m: how far points (n, 3), m, are outside its ball; negative within."""
+        return np.linalg.norm(points - np.asarray(self.center_m), axis=1) - self.radius_m
+
 
 @dataclass(frozen=True)
 class RefinedArea:
@@ -71,8 +75,8 @@ class SpacingField:
         """Spacing in m at points (n, 3) in m, (n,)."""
         h = np.full(len(points), self.spacing_m)
         for r in self.refinements:
-            outside = np.maximum(0.0, np.linalg.norm(points - np.asarray(r.center_m), axis=1) - r.radius_m)
-            h = np.minimum(h, r.spacing_m + r.growth * outside)
+            outside = r.distance_outside(points)
+            h = np.minimum(h, r.spacing_m + r.growth * np.maximum(0.0, outside))
         for area in self.areas:
             h = np.minimum(h, area.spacing(points, self.spacing_m))
         return h
