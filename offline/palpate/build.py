@@ -144,8 +144,8 @@ def build_full_model(
         f"{' + '.join(str(len(p.nodes)) for p in patches)} in contact"
     )
     for table, patch in zip(config.contact, patches, strict=True):
-        if text := thin_patch(table.name, patch, cloud):
-            progress.warn(text)
+        if thin := thin_patch(table.name, patch, cloud):
+            progress.warn(thin)
 
     progress(f"assembly, {config.discretization.method}")
     assemble = _ASSEMBLE[config.discretization.method]

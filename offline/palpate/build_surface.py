@@ -98,8 +98,8 @@ def build_surface_model(config: Config, folder: Path, progress: Progress = NO_PR
     progress("assembly, conservative")
     body = conservative.assemble(cloud, material, fixed, [], support)
     touched = _touched(config, cloud, fixed, body.basis.value)
-    if text := thin_working_area(config, cloud, touched.nodes[touched.working]):
-        progress.warn(text)
+    if thin := thin_working_area(config, cloud, touched.nodes[touched.working]):
+        progress.warn(thin)
     n_rows, n_solves = body.stiffness.shape[0], int(_SURFACE_SOLVES * guess) + 3 * len(touched.nodes)
     progress(f"factor, {solver_name(n_rows, n_solves)}")
     progress.note(f"memory needed about {needed / 2**30:.1f} GiB")

@@ -150,7 +150,7 @@ def test_fixed_plane_outside(tmp_path: Path) -> None:
     assert "Region" not in message
 
 
-def test_sharp_rim(tmp_path: Path) -> None:
+def test_sharp_rim() -> None:
     """A patch on a rim holds nodes of both of its sides, none closer to another than nodes are elsewhere."""
     config = load_config(CASES / "scene-sharp-rim.toml")
     cloud = build_cloud(config, CASES)
@@ -162,6 +162,10 @@ def test_sharp_rim(tmp_path: Path) -> None:
     np.testing.assert_allclose(patch.normal, (1, 0, 0), atol=0.2)
     nearest = cKDTree(cloud.points).query(cloud.points[patch.nodes], k=2)[0][:, 1]
     assert np.all(nearest > 0.5 * cloud.spacing[patch.nodes])
+
+
+@pytest.mark.slow
+def test_a_model_of_a_patch_on_a_sharp_rim_is_built(tmp_path: Path) -> None:
     shutil.copy(CASES / "geo-sharp-rim.stl", tmp_path)
     shutil.copy(CASES / "scene-sharp-rim.toml", tmp_path)
     done = build(tmp_path / "scene-sharp-rim.toml")
