@@ -15,9 +15,13 @@ from palpate.discretization import conservative
 from palpate.discretization.resolution import resolved_frequency_hz
 from palpate.expected import expected_size
 from palpate.geometry.cloud import NodeCloud
+from palpate.geometry.fill import fill_surface
 from palpate.geometry.ply import ply_bytes
 from palpate.geometry.shapes import ball, box_lattice
-from palpate.inclusions import with_inclusions
+from palpate.geometry.spacing import RefinedArea
+from palpate.geometry.surface import load_surface
+from palpate.inclusions import finer_around_inclusions, with_inclusions
+from palpate.modes.held_body import hold
 from palpate.scene.material import Material
 from palpate.scene.schema import ConfigError, canonical_text, check_config, fingerprint
 from palpate.scene_cloud import build_cloud
@@ -92,7 +96,7 @@ def test_cells_within_are_stiffer_and_their_volume_is_the_inclusions(cloud: Node
     depth = 0.008 - np.linalg.norm(cloud.centroids - (0, 0, 0.022), axis=1)
     np.testing.assert_array_equal(stiffness[depth > 0.003], 10.0)
     np.testing.assert_array_equal(stiffness[depth < -0.003], 1.0)
-    volume = (stiffness - 1) / 9 @ cloud.volumes
+    volume = np.log10(stiffness) @ cloud.volumes
     assert volume == pytest.approx(4 / 3 * np.pi * 0.008**3, rel=0.03)
 
 
@@ -118,7 +122,7 @@ def test_where_inclusions_overlap_the_later_one_counts(cloud: NodeCloud, folder:
     scene["inclusion"].append(core)
     stiffness = stiffness_of(cloud, scene, folder)
     assert stiffness.min() == pytest.approx(0.1)
-    assert 5 < stiffness.max() < 10
+    assert 3 < stiffness.max() < 10
 
 
 def test_a_uniform_inclusion_is_another_material(cloud: NodeCloud, folder: Path) -> None:
@@ -187,3 +191,39 @@ def test_files_and_stages_know_the_inclusion(folder: Path) -> None:
     missing = changed(shape="surface", file="none.ply", center_m=None, radius_m=None)
     with pytest.raises(FileNotFoundError, match=r"inclusion\[0\].file = 'none.ply'"):
         fingerprint(check_config(missing, "scene"), folder)
+
+
+PLACES_M = (0.0, 0.005, 0.01, 0.015, 0.02)
+# How much stiffer the block is at these places along x on its top, %, under a normal pressure ~ exp(-r² / (2 (3 mm)²)):
+# quadratic hexahedra, 33,075 unknowns for the half y >= 0, the modulus taken at each quadrature point (scikit-fem).
+CHANGES = {10.0: (15.01, 12.23, 6.90, 2.96, 1.02), 0.2: (-7.99, -6.67, -3.96, -1.76, -0.61)}
+
+
+def stiffness_along_x(cloud: NodeCloud) -> NDArray[np.float64]:
+    """N/m, the force over the mean displacement that it weighs, at each place."""
+    bottom = np.flatnonzero(cloud.points[:, 2] < 1e-9)
+    body = conservative.assemble(cloud, Material(1.0, 0.45, 1.0), bottom, [])
+    loads = []
+    for x in PLACES_M:
+        squared = (cloud.points[:, 0] - x) ** 2 + cloud.points[:, 1] ** 2
+        weight = cloud.areas * np.exp(-squared / (2 * 0.003**2)) * (cloud.points[:, 2] > 0.04 - 1e-9)
+        force = np.outer(weight / weight.sum(), (0.0, 0.0, 1.0))
+        loads.append((body.basis.value.T @ force).ravel())
+    load = np.column_stack(loads)
+    return 1 / np.einsum("ij,ij->j", load, hold(body, bottom).solve(load))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("relative", "tolerance"), [(10.0, 0.05), (0.2, 0.15)])
+def test_an_inclusion_changes_the_force_map_as_finite_elements_say(
+    folder: Path, relative: float, tolerance: float
+) -> None:
+    """Measured: within 2 % of the change where it is stiffer, 13 % where it is softer."""
+    surface = load_surface(folder / "block.ply").surface
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-0.03, 0.031, 0.00125), np.arange(-8, 9) * 1e-3))
+    band = RefinedArea(np.column_stack([x, y, np.full(len(x), 0.04)]), 0.06 * 0.016, 0.0025)
+    config = check_config(changed(relative_stiffness=relative, spacing_m=0.0015), "scene")
+    cloud = fill_surface(surface, 0.006, (), (band, *finer_around_inclusions(config, folder)))
+    without = stiffness_along_x(cloud)
+    found = stiffness_along_x(with_inclusions(config, folder, cloud, no_warning)) / without - 1
+    np.testing.assert_allclose(100 * found, CHANGES[relative], rtol=tolerance)
