@@ -236,6 +236,51 @@ def test_models_of_both_kinds_are_loaded_in_turns_while_the_tool_presses_and_all
     assert np.linalg.norm(np.diff(recorded.ports["force_n"][:, 0], axis=0), axis=1).max() < 0.02 * limit
 
 
+@pytest.mark.slow
+def test_what_a_stiffer_model_gives_a_hand_that_pressed_a_soft_one_is_counted_apart(
+    serve: Callable[..., Any],
+    connect: Callable[..., Any],
+    make_surface_model: Callable[..., SurfaceModel],
+    tmp_path: Path,
+) -> None:
+    """Pressed in soft, let go stiff: the hand gets out more than it put in. Each model by itself gives out nothing."""
+    soft, stiff = make_surface_model(softness=6.0), make_surface_model()
+    save_model(replace(stiff, name="stiff", config_sha256="6f" * 32), tmp_path / "stiff.npz")
+    served = serve("--recordings", str(tmp_path), model=soft)
+    with connect(served.endpoint) as client:
+        x, y, z = client.acquire("tip")[1]["tools"]["tip"]["home_m"]
+
+        def move(*heights_m: float) -> None:
+            for height in np.linspace(*heights_m, 300):
+                client.command({"tip": [x, y, z + height]})
+                time.sleep(1e-3)
+
+        with client.pressing({"tip": [x, y, z + 1e-3]}):
+            client.force_when(lambda force: force["force_scale"] == [1.0], "the end of the soft start")
+            client.record("a.mcap")
+        move(1e-3, -3e-3)
+        with client.pressing({"tip": [x, y, z - 3e-3]}):
+            granted, answer = client.control("load", file="stiff.npz")
+            assert granted, answer
+        move(-3e-3, 1e-3)
+        with client.pressing({"tip": [x, y, z + 1e-3]}):
+            client.force_when(lambda force: force["n_contact_points"] == [0], "the end of contact")
+            assert client.control("record", file=None)[0]
+    recorded = assert_all_is_repeated(
+        tmp_path / "a.mcap", soft, replace(stiff, name="stiff", config_sha256="6f" * 32)
+    )
+    ticks, tip = recorded.ticks, recorded.ports[:, 0]
+    kept = tip["stored_j"] + tip["dissipated_j"] + ticks["tissue_stored_j"] + ticks["tissue_dissipated_j"]
+    largest = np.max(tip["work_j"])
+    np.testing.assert_allclose(tip["work_j"], kept, rtol=0, atol=1e-9 * largest)
+    assert np.min(tip["work_j"]) >= -1e-9
+    steps_m = np.diff(tip["position_m"], axis=0, prepend=tip["position_m"][:1])
+    felt = -np.cumsum(np.einsum("ti,ti->t", tip["force_n"], steps_m))
+    np.testing.assert_allclose(tip["work_j"] - tip["withheld_j"], felt, rtol=0, atol=1e-6 * largest)
+    assert felt[-1] < -0.2 * largest  # the hand has gained
+    assert tip["withheld_j"][-1] > 0.2 * largest
+
+
 def test_a_tool_that_is_lost_while_it_presses_fades_and_is_lifted_off(
     serve: Callable[..., Any], connect: Callable[..., Any], make_surface_model: Callable[..., SurfaceModel]
 ) -> None:

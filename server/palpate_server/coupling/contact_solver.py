@@ -1,7 +1,8 @@
 """The forces between rigid spheres and the points they touch in one tick: unilateral, with friction, and bonds.
 
-A *row* is a point in contact with one tool, with a normal n from the sphere's center to the point. Its force f on the tissue has
-the normal part lambda = n . f and the tangential part t. With the relative displacement of this tick, r = (u+ - u) - (c+ - c),
+A *row* is a point in contact with one tool, with the inward normal n of the tissue and the tilt e of the sphere against it. Its force f
+on the tissue has the normal part lambda = n . f and the tangential part t. The tool feels M f, M = 1 + e n^T: a side force where the
+sphere slopes. With the relative displacement of this tick, r = (u+ - u) - M^T (c+ - c),
 
     lambda >= -bond   and   n . r >= -slack, one of them with equality;  slack = max(gap, 0)
     |t| <= mu max(lambda, 0) + bond;  r tangential is zero, or opposite to t at the limit.
@@ -10,8 +11,8 @@ So a row never takes energy from the tissue: a gap that was open may close, what
 never closed beyond that (complementary to min(0, gap), not to 0). A bond is what a grip holds: above all forces while the tool
 is attached, none without.
 
-r is linear in the forces, r = base + A (f - f_before), A symmetric: displacement of the tissue after one tick, and of the spheres
-against their coupling springs. The rows are solved in turns, by projection (Gauss-Seidel), from the forces of the tick before.
+r is linear in the forces: A f, the displacement of the tissue after one tick, and M^T times how far each sphere moves on its
+coupling spring under the sum of M f. The rows are solved in turns, by projection (Gauss-Seidel), from the forces of the tick before.
 """
 
 from __future__ import annotations
@@ -38,10 +39,11 @@ class Rows(NamedTuple):
     """Up to n rows; those of one tick are the first n_rows[0].
 
     n_rows  (1,); slot, tool (n,): of each row; fixed (n,): 1 where the force is given, not solved
-    normal  (n, 3); slack (n,), m; friction (n,), bond (n,), N
+    normal, tilt  (n, 3); slack (n,), m; friction (n,), bond (n,), N
     force   (n, 3), N: before the tick, then solved
-    slip    (3 n,), m: r
+    slip    (3 n,), m: r, but for the springs; with them after `solve`
     matrix  (9 n²,), m/N: A, of the first 3 n_rows[0] rows and columns
+    spring  (n_tools,), m/N; more (n_tools, 3), N: what each tool feels by M f more than in the tick before
     sweeps  (2,): how many are allowed, and were made
     """
 
@@ -50,16 +52,19 @@ class Rows(NamedTuple):
     tool: Integers
     fixed: Integers
     normal: Floats
+    tilt: Floats
     slack: Floats
     friction: Floats
     bond: Floats
     force: Floats
     slip: Floats
     matrix: Floats
+    spring: Floats
+    more: Floats
     sweeps: Integers
 
 
-def make_rows(n: int, sweeps: int) -> Rows:
+def make_rows(n: int, n_tools: int, sweeps: int) -> Rows:
     """Room for n rows."""
     return Rows(
         n_rows=np.zeros(1, np.int64),
@@ -67,12 +72,15 @@ def make_rows(n: int, sweeps: int) -> Rows:
         tool=np.zeros(n, np.int64),
         fixed=np.zeros(n, np.int64),
         normal=np.zeros((n, 3)),
+        tilt=np.zeros((n, 3)),
         slack=np.zeros(n),
         friction=np.zeros(n),
         bond=np.zeros(n),
         force=np.zeros((n, 3)),
         slip=np.zeros(3 * n),
         matrix=np.zeros(9 * n * n),
+        spring=np.zeros(n_tools),
+        more=np.zeros((n_tools, 3)),
         sweeps=np.array([sweeps, 0]),
     )
 
@@ -101,6 +109,28 @@ def solve(rows: Rows) -> None:
         if change <= TOLERANCE * largest:
             break
     rows.sweeps[1] = sweep
+    for i in range(rows.n_rows[0]):
+        x, y, z = _on_spring(rows, i)
+        rows.slip[3 * i] += x
+        rows.slip[3 * i + 1] += y
+        rows.slip[3 * i + 2] += z
+
+
+@compiled
+def _on_spring(rows: Rows, i: int) -> tuple[float, float, float]:
+    """What a row's tool adds to its slip by moving on its spring, m."""
+    more, normal, tilt, spring = (
+        rows.more[rows.tool[i]],
+        rows.normal[i],
+        rows.tilt[i],
+        rows.spring[rows.tool[i]],
+    )
+    tilted = tilt[0] * more[0] + tilt[1] * more[1] + tilt[2] * more[2]
+    return (
+        spring * (more[0] + tilted * normal[0]),
+        spring * (more[1] + tilted * normal[1]),
+        spring * (more[2] + tilted * normal[2]),
+    )
 
 
 @compiled
@@ -111,19 +141,26 @@ def _solve_row(rows: Rows, i: int) -> float:
     a = first * size + first
     n0, n1, n2 = rows.normal[i, 0], rows.normal[i, 1], rows.normal[i, 2]
     bond = rows.bond[i]
-    # A n, of the row's own block
+    tilt, spring = rows.tilt[i], rows.spring[rows.tool[i]]
+    x, y, z = _on_spring(rows, i)
+    x, y, z = x + slip[first], y + slip[first + 1], z + slip[first + 2]
+    # A n + M^T M n, of the row's own block: M n = n + e, and e is across n
     an0 = matrix[a] * n0 + matrix[a + 1] * n1 + matrix[a + 2] * n2
     an1 = matrix[a + size] * n0 + matrix[a + size + 1] * n1 + matrix[a + size + 2] * n2
     an2 = matrix[a + 2 * size] * n0 + matrix[a + 2 * size + 1] * n1 + matrix[a + 2 * size + 2] * n2
+    steep = 1.0 + tilt[0] * tilt[0] + tilt[1] * tilt[1] + tilt[2] * tilt[2]
+    an0 += spring * (steep * n0 + tilt[0])
+    an1 += spring * (steep * n1 + tilt[1])
+    an2 += spring * (steep * n2 + tilt[2])
     normal_compliance = n0 * an0 + n1 * an1 + n2 * an2
-    trace = matrix[a] + matrix[a + size + 1] + matrix[a + 2 * size + 2]
+    trace = matrix[a] + matrix[a + size + 1] + matrix[a + 2 * size + 2] + spring * (2.0 + steep)
 
-    approach = n0 * slip[first] + n1 * slip[first + 1] + n2 * slip[first + 2]
+    approach = n0 * x + n1 * y + n2 * z
     before = n0 * force[i, 0] + n1 * force[i, 1] + n2 * force[i, 2]
     normal = max(-bond, before - (approach + rows.slack[i]) / normal_compliance)
     change = normal - before
     # Slip after the normal part, its tangential part, and the tangential force that would stop it
-    s0, s1, s2 = slip[first] + an0 * change, slip[first + 1] + an1 * change, slip[first + 2] + an2 * change
+    s0, s1, s2 = x + an0 * change, y + an1 * change, z + an2 * change
     along = n0 * s0 + n1 * s1 + n2 * s2
     step = _TANGENTIAL_STEP / (trace - normal_compliance)
     t0 = force[i, 0] - before * n0 - step * (s0 - along * n0)
@@ -150,6 +187,11 @@ def _change(rows: Rows, i: int, x: float, y: float, z: float) -> None:
     rows.force[i, 0] += x
     rows.force[i, 1] += y
     rows.force[i, 2] += z
+    more, normal, tilt = rows.more[rows.tool[i]], rows.normal[i], rows.tilt[i]
+    pressing = normal[0] * x + normal[1] * y + normal[2] * z
+    more[0] += x + pressing * tilt[0]
+    more[1] += y + pressing * tilt[1]
+    more[2] += z + pressing * tilt[2]
     size = 3 * rows.n_rows[0]
     row = 3 * i * size
     slip = rows.slip[:size]

@@ -13,15 +13,25 @@ Integers = NDArray[np.int64]
 NONE = -1
 
 
+class TooManyPoints(ValueError):
+    """count: of points within the reach of one."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__(f"{count} points are within the reach of one")
+        self.count = count
+
+
 def near_points(points: Floats, triangles: NDArray[np.int32], reach_m: float, most: int) -> Integers:
     """(n_points, k), k <= most: for each point those within reach_m, nearest first, itself included; NONE beyond them.
 
     Only points count that edges connect to it within the reach, so that the far side of a thin lobe does not.
-    The nearest `most` are kept where there are more.
+    Raises TooManyPoints where there are more than `most`.
     """
     starts, neighbors = _adjacency(len(points), triangles)
     table = np.full((len(points), most), NONE)
-    _fill(np.ascontiguousarray(points, dtype=float), starts, neighbors, reach_m, table)
+    largest = _fill(np.ascontiguousarray(points, dtype=float), starts, neighbors, reach_m, table)
+    if largest > most:
+        raise TooManyPoints(largest)
     return np.ascontiguousarray(table[:, : max(1, int(np.max(np.sum(table != NONE, axis=1), initial=1)))])
 
 
@@ -36,10 +46,11 @@ def _adjacency(n_points: int, triangles: NDArray[np.int32]) -> tuple[Integers, I
 
 
 @compiled
-def _fill(points: Floats, starts: Integers, neighbors: Integers, reach: float, table: Integers) -> None:
-    """Walk over the edges from each point, within the reach."""
+def _fill(points: Floats, starts: Integers, neighbors: Integers, reach: float, table: Integers) -> int:
+    """Walk over the edges from each point, within the reach. Returns the largest number of points found."""
     n = points.shape[0]
     seen, queue, distance = np.full(n, NONE), np.empty(n, np.int64), np.empty(n)
+    largest = 0
     for start in range(n):
         queue[0], seen[start], distance[0] = start, start, 0.0
         count, next_one = 1, 0
@@ -55,6 +66,8 @@ def _fill(points: Floats, starts: Integers, neighbors: Integers, reach: float, t
                 if apart <= reach:
                     queue[count], distance[count] = other, apart
                     count += 1
+        largest = max(largest, count)
         order = np.argsort(distance[:count])
         for k in range(min(count, table.shape[1])):
             table[start, k] = queue[order[k]]
+    return largest

@@ -1,9 +1,12 @@
 """Rigid spheres in contact with the surface of a body: fixed material points against moving spheres.
 
+Contact is that of linear theory (Hertz 1882; Sneddon 1965): gaps are measured, and the tissue is pressed, along its normals at
+rest. The sphere feels the gradient of the gap, so a side force as well where it slopes.
+
 Each tool is a sphere on a massless coupling spring, which is between it and the device. Each tick finds the points near each
 sphere (`tracking`), solves all contacts of all tools as one system (`contact_solver`) and advances the body.
 
-Passivity. The same rows and normals map force and displacement, so the work of the contacts on the body is exact. Contacts may
+Passivity. The same rows, normals and tilts map force and displacement, so the work of the contacts is exact. Contacts may
 only lose energy: where an iterate that has not converged would give some out, all forces are scaled back, to a share a of
 themselves, with which the loss a p - a² w is not negative. Old penetration is pushed out with energy that contacts lost before,
 and never more. So the work of the tools is what is stored in body and springs plus what is lost, at each tick.
@@ -24,7 +27,7 @@ from palpate_server.bodies import elastic_surface
 from palpate_server.bodies.elastic_surface import FREE_WORK, NOBODY, SELF_WORK, STORED, WORK, ElasticSurface
 from palpate_server.coupling import contact_solver, tracking
 from palpate_server.coupling.contact_solver import Rows
-from palpate_server.coupling.near_points import near_points
+from palpate_server.coupling.near_points import TooManyPoints, near_points
 from palpate_server.coupling.tracking import Tracking
 from palpate_server.realtime.compiled import compiled
 
@@ -39,11 +42,16 @@ LIFTED, TOUCHING, GRABBING = range(3)
 DEFAULT_STIFFNESS_N_PER_M = 700.0
 DEFAULT_SWEEPS = 40
 
-_MOST_NEAR = 80  # points near each point; more than a sphere touches where the spacing fits its radius
+_MOST_NEAR = 400  # points near one, of which a sphere that is pressed in by its radius touches about half
 _SPARE_SLOTS = 16  # for points in contact that are no longer near the anchor
 _MARGIN = 0.05  # of the radius: points with a smaller gap are rows of the system
 _NEAR_GAP = 0.4  # of the radius: points with a larger gap are looked at only
 _EVERY = 8  # ticks
+_SINE, _COSINE, _TANGENT = (
+    math.sqrt(0.75),
+    0.5,
+    math.sqrt(3.0),
+)  # of 60 degrees, where a sphere's side becomes a cone
 _GRIP = 1e12  # N
 _RELEASE_S = 0.02  # time constant of a bond after release
 _LEAST_BOND_N = 1e-3
@@ -59,10 +67,11 @@ class Tools(NamedTuple):
     """n tools; arrays (n,) where nothing else is said.
 
     radius m, friction, compliance m/N (of the coupling spring)
-    device, center  (n, 3), m: of the device and of the sphere in the last tick; reaction (n, 3), N: force of the sphere on the tissue
+    device, center  (n, 3), m: of the device and of the sphere in the last tick; reaction (n, 3), N: that the sphere feels, times -1
     moved           (n, 3), m: by the device in this tick
     wanted, attached  of the last tick; attached: 1 while points are held
     work, stored, dissipated  J: work of the device, energy in the spring, energy lost in contact and spring
+    drift           (n, 3), m: how far the tissue that the tool presses has moved, on average
     """
 
     radius: Floats
@@ -77,19 +86,22 @@ class Tools(NamedTuple):
     work: Floats
     stored: Floats
     dissipated: Floats
+    drift: Floats
 
 
 class Slots(NamedTuple):
     """Watched points, n_slots / n_tools for each tool.
 
     force (n_slots, 3), N, on the tissue, of the last tick; bond (n_slots,), N; gap (n_slots,), m
-    normal (n_slots, 3); busy (n_slots,): 1 where there is a force or a bond
+    normal (n_slots, 3), inward; busy (n_slots,): 1 where there is a force or a bond
+    tilt   (n_slots, 3): of the sphere against it, its slope outwards from its axis
     """
 
     force: Floats
     bond: Floats
     gap: Floats
     normal: Floats
+    tilt: Floats
     busy: Integers
 
 
@@ -115,7 +127,7 @@ class SphereContact(NamedTuple):
             *(getattr(body, name) for name in elastic_surface.STATE),
             *(self.tracking.anchor, self.tracking.complete, self.tracking.position),
             *tools,
-            *(slots.force, slots.bond, slots.gap, slots.normal, slots.busy),
+            *(slots.force, slots.bond, slots.gap, slots.normal, slots.tilt, slots.busy),
             *(self.budget, self.tick),
         ]
 
@@ -150,13 +162,14 @@ def make(
     stiffness_n_per_m  of the coupling springs, of all or of each tool
     sweeps             of the solver at most in one tick
 
-    Raises ValueError for a model without points, and as `elastic_surface.make_body`.
+    Raises ValueError for a model without points, for a tool that is too large for points so close together, and as
+    `elastic_surface.make_body`.
     """
     if model.n_points == 0:
         raise ValueError("points: expected at least one")
     n = len(model.tools)
     largest = max((tool.radius_m for tool in model.tools), default=0.0)
-    near = near_points(model.points, model.triangles, _reach(model, largest), _MOST_NEAR)
+    near = _near(model, largest)
     per_tool = near.shape[1] + _SPARE_SLOTS
     contact = _assemble(model, near, n, per_tool, largest, sweeps)
     stiffness = np.broadcast_to(np.asarray(stiffness_n_per_m, float), (n,))
@@ -177,6 +190,18 @@ def empty(n_tools: int) -> SphereContact:
         accuracy=SurfaceAccuracy.unknown(0),
     )  # fmt: skip
     return _assemble(model, np.zeros((0, 1), np.int64), n_tools, 0, 0.0, 0)
+
+
+def _near(model: SurfaceModel, radius: float) -> Integers:
+    """As `near_points`, for a sphere. Raises ValueError where it is too large."""
+    try:
+        return near_points(model.points, model.triangles, _reach(model, radius), _MOST_NEAR)
+    except TooManyPoints as error:
+        fit = radius * math.sqrt(_MOST_NEAR / error.count)
+        raise ValueError(
+            f"a tool of radius_m = {radius:g} is near {error.count} points of {model.name!r} at once, of which it may touch "
+            f"most: expected at most {_MOST_NEAR}, as with a radius of about {fit:.1g} m or a larger spacing of the points"
+        ) from error
 
 
 def _reach(model: SurfaceModel, radius: float) -> float:
@@ -208,9 +233,10 @@ def _assemble(
             bond=np.zeros(slots),
             gap=np.zeros(slots),
             normal=np.zeros((slots, 3)),
+            tilt=np.zeros((slots, 3)),
             busy=np.zeros(slots, np.int64),
         ),
-        rows=contact_solver.make_rows(slots, sweeps),
+        rows=contact_solver.make_rows(slots, n, sweeps),
         budget=np.zeros(1),
         tick=np.zeros(1, np.int64),
     )
@@ -230,6 +256,7 @@ def _make_tools(n: int) -> Tools:
         work=np.zeros(n),
         stored=np.zeros(n),
         dissipated=np.zeros(n),
+        drift=np.zeros((n, 3)),
     )
 
 
@@ -267,13 +294,13 @@ def put_to_rest(contact: SphereContact) -> None:
         contact.tools.attached[tool] = 0
         contact.tools.work[tool] = contact.tools.stored[tool] = contact.tools.dissipated[tool] = 0.0
         for c in range(3):
-            contact.tools.reaction[tool, c] = 0.0
+            contact.tools.reaction[tool, c] = contact.tools.drift[tool, c] = 0.0
             contact.tools.center[tool, c] = contact.tools.device[tool, c]
     for slot in range(contact.slots.busy.size):
         contact.slots.bond[slot] = contact.slots.gap[slot] = 0.0
         contact.slots.busy[slot] = 0
         for c in range(3):
-            contact.slots.force[slot, c] = contact.slots.normal[slot, c] = 0.0
+            contact.slots.force[slot, c] = contact.slots.normal[slot, c] = contact.slots.tilt[slot, c] = 0.0
     contact.budget[0] = 0.0
 
 
@@ -358,6 +385,9 @@ def _find_rows(contact: SphereContact, tool: int, wanted: int) -> None:
     per_tool = slots.busy.size // contact.tools.radius.size
     radius = contact.tools.radius[tool]
     beneath = wanted != LIFTED and _is_beneath(contact, tool)
+    contact.rows.spring[tool] = contact.tools.compliance[tool]
+    for c in range(3):
+        contact.rows.more[tool, c] = -contact.tools.reaction[tool, c]
     for slot in range(tool * per_tool, (tool + 1) * per_tool):
         point = body.watched[slot]
         if point == NOBODY:
@@ -392,33 +422,36 @@ def _is_beneath(contact: SphereContact, tool: int) -> bool:
 
 @compiled
 def _face(contact: SphereContact, tool: int, slot: int, beneath: bool) -> bool:
-    """Write gap and normal of a watched point against a tool. Returns whether it is to be a row.
+    """Write gap, normal and tilt of a watched point against a tool. Returns whether it is to be a row.
 
-    The tip is the paraboloid that osculates the sphere along the point's normal at rest, as in Hertz's theory. Unlike a sphere's,
-    its sides never stand upright: points that are pressed deep can't pass around it.
+    The gap is the way from the sphere to the point along the normal at rest. Sidewards the sphere stands where it is over the
+    tissue at rest, moved by the drift. Beyond _SINE of the radius from its axis the tip is the cone that touches it there.
     """
-    slots, body, follow = contact.slots, contact.body, contact.tracking
-    point, radius = body.watched[slot], contact.tools.radius[tool]
-    distance, height = 0.0, 0.0
+    slots, body, follow, tools = contact.slots, contact.body, contact.tracking, contact.tools
+    point, radius, anchor = body.watched[slot], tools.radius[tool], follow.anchor[tool]
+    height, apart, along = 0.0, 0.0, 0.0
     for c in range(3):
-        apart = follow.position[slot, c] - contact.tools.center[tool, c]
-        distance += apart * apart
-        height -= apart * follow.normals[point, c]
-    lateral = math.sqrt(max(0.0, distance - height * height))
-    lift = radius - height
-    length, alignment = 0.0, 0.0
-    anchor = follow.anchor[tool]
+        away = follow.points[point, c] - tools.center[tool, c]
+        height -= (away + body.displacement[slot, c]) * follow.normals[point, c]
+        away += tools.drift[tool, c]
+        apart += away * away
+        along += away * follow.normals[point, c]
+    lateral = math.sqrt(max(0.0, apart - along * along))
+    if lateral < _SINE * radius:
+        depth = math.sqrt(radius * radius - lateral * lateral)
+        slope = 1.0 / depth
+    else:
+        depth = (_COSINE + _SINE * _TANGENT) * radius - _TANGENT * lateral
+        slope = _TANGENT / lateral
+    gap, approach, alignment = height - depth, 0.0, 0.0
     for c in range(3):
         outward = follow.normals[point, c]
-        slots.normal[slot, c] = follow.position[slot, c] - contact.tools.center[tool, c] - lift * outward
-        length += slots.normal[slot, c] * slots.normal[slot, c]
+        beside = follow.points[point, c] + tools.drift[tool, c] - tools.center[tool, c] - along * outward
+        slots.normal[slot, c] = -outward
+        slots.tilt[slot, c] = slope * beside if slots.bond[slot] == 0.0 else 0.0
+        approach -= outward * (body.step[slot, c] - tools.moved[tool, c])
+        approach -= slots.tilt[slot, c] * tools.moved[tool, c]
         alignment += outward * follow.normals[anchor, c]
-    length = math.sqrt(length)
-    approach = 0.0
-    for c in range(3):
-        slots.normal[slot, c] /= length
-        approach += slots.normal[slot, c] * (body.step[slot, c] - contact.tools.moved[tool, c])
-    gap = (height - radius + 0.5 * lateral * lateral / radius) * radius / length
     if height <= 0.0:
         slots.gap[slot] = min(gap, 0.0) if beneath else gap
         return beneath and alignment > 0.0 and lateral < radius
@@ -440,15 +473,28 @@ def _add_row(contact: SphereContact, tool: int, slot: int, wanted: int) -> None:
         period = body.period_s[0]
         bleed = min(-gap * period / _BLEED_S, _LARGEST_BLEED_M_PER_S * period)
     rows.slack[i] = max(gap, 0.0) - bleed if slots.bond[slot] == 0.0 else 0.0
+    tilt, pressing, tilted = slots.tilt[slot], _pressing(slots, slot), 0.0
     for c in range(3):
-        rows.normal[i, c] = slots.normal[slot, c]
+        tilted += tilt[c] * contact.tools.moved[tool, c]
+    for c in range(3):
+        rows.normal[i, c], rows.tilt[i, c] = slots.normal[slot, c], tilt[c]
         rows.force[i, c] = slots.force[slot, c]
-        rows.slip[3 * i + c] = body.step[slot, c] - contact.tools.moved[tool, c]
+        rows.slip[3 * i + c] = (
+            body.step[slot, c] - contact.tools.moved[tool, c] - tilted * slots.normal[slot, c]
+        )
+        rows.more[tool, c] += slots.force[slot, c] + pressing * tilt[c]
+
+
+@compiled
+def _pressing(slots: Slots, slot: int) -> float:
+    """Normal force at a watched point, N."""
+    force, normal = slots.force[slot], slots.normal[slot]
+    return force[0] * normal[0] + force[1] * normal[1] + force[2] * normal[2]
 
 
 @compiled
 def _fill_matrix(contact: SphereContact) -> None:
-    """A: the one-tick compliance of the tissue between all rows, and the springs' between the rows of a tool."""
+    """A: the one-tick compliance of the tissue between all rows."""
     rows, body = contact.rows, contact.body
     n = rows.n_rows[0]
     compliance, matrix = body.compliance, rows.matrix
@@ -456,12 +502,10 @@ def _fill_matrix(contact: SphereContact) -> None:
         first = 3 * body.watched[rows.slot[i]]
         for j in range(n):
             column = 3 * body.watched[rows.slot[j]]
-            spring = contact.tools.compliance[rows.tool[i]] if rows.tool[i] == rows.tool[j] else 0.0
             for c in range(3):
                 place = (3 * i + c) * 3 * n + 3 * j
                 for d in range(3):
                     matrix[place + d] = compliance[first + c, column + d]
-                matrix[place + c] += spring
 
 
 @compiled
@@ -475,17 +519,11 @@ def _load(contact: SphereContact) -> float:
             elastic_surface.add_load(body, rows.tool[i], rows.slot[i], x, y, z)
     elastic_surface.finish_load(body)
     given, taken = -body.energy[FREE_WORK], body.energy[SELF_WORK]
-    for i in range(rows.n_rows[0]):
-        tool = rows.tool[i]
-        for c in range(3):
-            moved = tools.moved[tool, c] + tools.compliance[tool] * tools.reaction[tool, c]
-            given += rows.force[i, c] * moved
     for tool in range(tools.radius.size):
-        x, y, z = 0.0, 0.0, 0.0
-        for i in range(rows.n_rows[0]):
-            if rows.tool[i] == tool:
-                x, y, z = x + rows.force[i, 0], y + rows.force[i, 1], z + rows.force[i, 2]
-        taken += tools.compliance[tool] * (x * x + y * y + z * z)
+        for c in range(3):
+            total = tools.reaction[tool, c] + rows.more[tool, c]
+            given += total * (tools.moved[tool, c] + tools.compliance[tool] * tools.reaction[tool, c])
+            taken += tools.compliance[tool] * total * total
     budget = contact.budget[0]
     share = 1.0
     if given - taken < -budget:
@@ -518,7 +556,8 @@ def _settle(contact: SphereContact, tool: int, wanted: int) -> None:
     for c in range(3):
         total = 0.0
         for slot in range(first, last):
-            total += slots.force[slot, c]
+            if slots.busy[slot] != 0:
+                total += slots.force[slot, c] + _pressing(slots, slot) * slots.tilt[slot, c]
         tools.reaction[tool, c] = total
         tools.center[tool, c] = tools.device[tool, c] - tools.compliance[tool] * total
         work += total * tools.moved[tool, c]
@@ -527,6 +566,7 @@ def _settle(contact: SphereContact, tool: int, wanted: int) -> None:
     tools.work[tool] += work
     tools.dissipated[tool] += work - body.group_work[tool] - (stored - tools.stored[tool])
     tools.stored[tool] = stored
+    _follow_tissue(contact, tool, first, last)
     if wanted == GRABBING and tools.attached[tool] == 0:
         _attach(contact, tool, first, last)
     elif wanted != GRABBING:
@@ -535,14 +575,32 @@ def _settle(contact: SphereContact, tool: int, wanted: int) -> None:
 
 
 @compiled
+def _follow_tissue(contact: SphereContact, tool: int, first: int, last: int) -> None:
+    """The drift: the mean displacement of the points that are pressed, weighted with their force; without any, that of the anchor."""
+    slots, body, drift = contact.slots, contact.body, contact.tools.drift[tool]
+    pressed = 0.0
+    for c in range(3):
+        drift[c] = 0.0
+    for slot in range(first, last):
+        weight = max(0.0, _pressing(slots, slot)) if slots.busy[slot] != 0 else 0.0
+        pressed += weight
+        for c in range(3):
+            drift[c] += weight * body.displacement[slot, c]
+    for c in range(3):
+        drift[c] = drift[c] / pressed if pressed > 0.0 else 0.0
+    if pressed == 0.0:
+        for slot in range(first, last):
+            if body.watched[slot] != NOBODY and body.watched[slot] == contact.tracking.anchor[tool]:
+                for c in range(3):
+                    drift[c] = body.displacement[slot, c]
+
+
+@compiled
 def _attach(contact: SphereContact, tool: int, first: int, last: int) -> None:
     """Hold on to the points that are pressed."""
     slots = contact.slots
     for slot in range(first, last):
-        pressed = 0.0
-        for c in range(3):
-            pressed += slots.force[slot, c] * slots.normal[slot, c]
-        if pressed > 0.0:
+        if slots.busy[slot] != 0 and _pressing(slots, slot) > 0.0:
             slots.bond[slot] = _GRIP
             slots.busy[slot] = 1
             contact.tools.attached[tool] = 1
@@ -579,7 +637,8 @@ def _report(contact: SphereContact, tool: int, one: Record) -> None:
         along = x * r0 + y * r1 + z * r2
         r0, r1, r2 = r0 - along * x, r1 - along * y, r2 - along * z
         weight = abs(normal)
-        n0, n1, n2 = n0 - weight * x, n1 - weight * y, n2 - weight * z
+        tilt = rows.tilt[i]
+        n0, n1, n2 = n0 - weight * (x + tilt[0]), n1 - weight * (y + tilt[1]), n2 - weight * (z + tilt[2])
         s0, s1, s2 = s0 + weight * r0, s1 + weight * r1, s2 + weight * r2
         pressed += weight
         if math.sqrt(r0 * r0 + r1 * r1 + r2 * r2) > _SLIDING_M:
@@ -649,10 +708,12 @@ def save(contact: SphereContact, state: Floats, place: int) -> int:
     place = _copy(tools.work, state, place)
     place = _copy(tools.stored, state, place)
     place = _copy(tools.dissipated, state, place)
+    place = _copy(tools.drift, state, place)
     place = _copy(slots.force, state, place)
     place = _copy(slots.bond, state, place)
     place = _copy(slots.gap, state, place)
     place = _copy(slots.normal, state, place)
+    place = _copy(slots.tilt, state, place)
     place = _copy(slots.busy, state, place)
     place = _copy(contact.budget, state, place)
     return _copy(contact.tick, state, place)

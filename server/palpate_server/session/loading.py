@@ -66,7 +66,10 @@ class ModelLoader:
         if isinstance(state.model, SurfaceModel) and (away := models.off_the_patches(model, displacement)):
             raise Refused("bad_model", f"tool {away[0]!r} is not on its patch: bring it to its start first")
         touch = Touch(memory.wanted.copy(), memory.reactions.copy())
-        following = models.make_settled(model, tips, displacement, touch)
+        try:
+            following = models.make_settled(model, tips, displacement, touch)
+        except ValueError as error:  # such as a tool too large for its points
+            raise Refused("bad_model", str(error)) from error
         coupling = cross_fade.to_another(state.memory.coupling, following, step)
         fading = shared_memory.with_coupling(state.memory, coupling)
         memory = shared_memory.with_coupling(state.memory, cross_fade.after(coupling))

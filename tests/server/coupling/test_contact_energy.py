@@ -6,13 +6,15 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from numba import njit
 from numpy.typing import NDArray
 
 from palpate.model_file import SurfaceModel, ToolShape
-from palpate_server.coupling import sphere_contact
+from palpate_server.bodies import elastic_surface
+from palpate_server.coupling import contact_solver, sphere_contact
 from palpate_server.coupling.sphere_contact import GRABBING, LIFTED, TOUCHING, SphereContact
 from palpate_server.diagnostics.sample_surface import half_space_model
-from palpate_server.realtime.native_image import make_image
+from palpate_server.realtime.native_image import make_image, view
 from palpate_server.realtime.records import REACTION
 from palpate_server.simulation import _advance
 
@@ -159,8 +161,52 @@ def test_no_motion_gets_energy_out_in_a_million_ticks(soft_and_stiff: SurfaceMod
         check_all_scenes(soft_and_stiff, 12_500, seed)
 
 
+@njit
+def advance_with_a_broken_rule(image, position, wanted, scaled):
+    """A tick in which normal forces are complementary to gap >= 0, not to gap >= min(0, gap before).
+
+    scaled: whether forces are still scaled back where they would give out energy
+    """
+    contact = view(image)
+    rows = contact.rows
+    elastic_surface.predict(contact.body)
+    rows.n_rows[0] = 0
+    for tool in range(wanted.size):
+        sphere_contact._move(contact, tool, position[tool], wanted[tool])
+        if wanted[tool] != LIFTED:
+            sphere_contact._track(contact, tool)
+        sphere_contact._find_rows(contact, tool, wanted[tool])
+    for i in range(rows.n_rows[0]):
+        rows.slack[i] = contact.slots.gap[rows.slot[i]]
+    sphere_contact._fill_matrix(contact)
+    contact_solver.solve(rows)
+    share = sphere_contact._load(contact)
+    if not scaled:
+        share = 1.0
+    elastic_surface.commit(contact.body, share)
+    sphere_contact._keep_forces(contact, share)
+    for tool in range(wanted.size):
+        sphere_contact._settle(contact, tool, wanted[tool])
+    contact.tick[0] += 1
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_a_broken_rule_gives_out_energy_unless_its_forces_are_scaled_back(
+    soft_and_stiff: SurfaceModel, scaled: bool
+) -> None:
+    """The tests above would find it; and the second guard holds where the first is broken."""
+    positions, wanted = touching_inside(500)
+    contact, lowest = sphere_contact.make(soft_and_stiff), 0.0
+    image = make_image(contact)
+    for position, want in zip(positions, wanted, strict=True):
+        advance_with_a_broken_rule(image, position, want, scaled)
+        lowest = min(lowest, float(contact.tools.work.sum()))
+    check_balance(contact)
+    assert lowest >= -ALLOWED_J if scaled else lowest < -1e-5
+
+
 def test_pushing_penetration_out_for_nothing_is_found(soft_and_stiff: SurfaceModel) -> None:
-    """The test above would not pass with a rule that is broken."""
+    """The tests above would not pass with a budget of energy that nobody paid for."""
     positions, wanted = touching_inside(1_000)
     lowest, _ = lowest_ledger(sphere_contact.make(soft_and_stiff), positions, wanted, free_budget=True)
     assert lowest < -1e-5
