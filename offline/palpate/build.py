@@ -27,7 +27,7 @@ from palpate.modes.body_modes import by_ritz, ritz_body_modes
 from palpate.modes.dense import elastic_modes
 from palpate.modes.elastic_modes import ElasticModes
 from palpate.modes.ritz import StaticSpace
-from palpate.progress import NO_PROGRESS, Progress, Warnings
+from palpate.progress import NO_PROGRESS, Progress
 from palpate.reduction.accuracy import measure, refuse_meaningless
 from palpate.reduction.methods import Reduction, reduce
 from palpate.reduction.passive import RitzSubspace, passive
@@ -35,7 +35,7 @@ from palpate.reduction.surface import fit_surface_output
 from palpate.scene.material import Material
 from palpate.scene.plausibility import plausibility
 from palpate.scene.schema import Config, ReductionTable, canonical_text, fingerprint
-from palpate.scene_cloud import build_cloud, contact_patches, fixed_nodes, shown_surface
+from palpate.scene_cloud import cloud_and_warnings, contact_patches, fixed_nodes, shown_surface
 from palpate.stage_cache import NO_CACHE, StageCache
 from palpate.stage_keys import StageKeys, stage_keys
 from palpate.thin_parts import thin_patch
@@ -133,7 +133,7 @@ def build_full_model(
     keys = stage_keys(config, folder)
     require_memory(expected_size(config, folder))
     progress("node cloud")
-    cloud, warnings = cache.kept("cloud", keys.cloud, lambda: _cloud(config, folder))
+    cloud, warnings = cache.kept("cloud", keys.cloud, lambda: cloud_and_warnings(config, folder))
     for text in (*warnings, *plausibility(config, float(np.max(np.ptp(cloud.points, axis=0))))):
         progress.warn(text)
     cloud = with_inclusions(config, folder, cloud, progress.warn)
@@ -162,13 +162,6 @@ def build_full_model(
     system = viscoelastic_system(modes, material.prony)
     progress.note(f"{system.n_states:,} states")
     return FullModel(cloud, material, patches, body, modes, change, system)
-
-
-def _cloud(config: Config, folder: Path) -> tuple[NodeCloud, tuple[str, ...]]:
-    """The node cloud, and the warnings that its making gave."""
-    heard = Warnings()
-    cloud = build_cloud(config, folder, heard)
-    return cloud, tuple(heard.texts)
 
 
 def _modes(

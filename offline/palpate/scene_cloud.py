@@ -18,7 +18,7 @@ from palpate.geometry.spacing import RefinedArea, Refinement, SpacingField
 from palpate.geometry.surface import load_surface
 from palpate.inclusions import finer_around_inclusions
 from palpate.model_file import ToolShape
-from palpate.progress import NO_PROGRESS, Progress
+from palpate.progress import NO_PROGRESS, Progress, Warnings
 from palpate.scene.regions import NearestRegion
 from palpate.scene.schema import (
     BallGeometry,
@@ -68,6 +68,12 @@ def held_part(config: Config) -> Distance | None:
     if not regions:
         return None
     return lambda points: np.min([distance_outside(region, points) for region in regions], axis=0)
+
+
+def cloud_and_warnings(config: Config, folder: Path) -> tuple[NodeCloud, tuple[str, ...]]:
+    """As `build_cloud`, with the warnings that it gave."""
+    heard = Warnings()
+    return build_cloud(config, folder, heard), tuple(heard.texts)
 
 
 def fixed_nodes(config: Config, cloud: NodeCloud) -> Indices:

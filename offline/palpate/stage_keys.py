@@ -15,20 +15,23 @@ from palpate.stage_cache import key_of
 _CLOUD = ("files.py", "scene", "geometry", "scene_cloud.py", "inclusions.py")
 _BODY = (*_CLOUD, "meshfree", "discretization", "factorization")
 _MODES = (*_BODY, "modes")
+_SURFACE = (*_MODES, "surface_model", "build_surface.py")
 _LIBRARIES = ("numpy", "scipy", "numba", "libigl")
 
 
 @dataclass(frozen=True)
 class StageKeys:
-    """Keys of the node cloud, the assembled body and its modes.
+    """Keys of the node cloud, the assembled body, its modes, and what a surface model is made of.
 
     Each holds the code that computes the stage and the versions of the libraries. Young's modulus, density, Prony series,
     band and reduction are in none: bodies are assembled in unit constants, and the vectors at 0 Hz serve every band.
+    Only the stages of a surface model depend on the whole scene beside `surface`.
     """
 
     cloud: str
     body: str
     modes: str
+    surface: str
 
 
 def stage_keys(config: Config, folder: Path) -> StageKeys:
@@ -51,13 +54,15 @@ def stage_keys(config: Config, folder: Path) -> StageKeys:
     held: list[object] = []
     if isinstance(config.geometry, SurfaceGeometry):
         refined = [p for p in patches if p[2] is not None]
-    finer = [refined, shapes, scene["surface"], bool(scene["tool"])]
+        held = scene["fixed"]
+    area = {name: scene["surface"][name] for name in ("spacing_m", "working_area")}
+    finer = [refined, shapes, area, bool(scene["tool"])]
     cloud = key_of(_code(_CLOUD), geometry, files, finer, held)
     body = key_of(
         _code(_BODY), cloud, scene["fixed"], patches, scene["discretization"], scene["inclusion"],
         config.material.material().poissons_ratio, solver_name(),
     )  # fmt: skip
-    return StageKeys(cloud, body, key_of(_code(_MODES), body))
+    return StageKeys(cloud, body, key_of(_code(_MODES), body), key_of(_code(_SURFACE), body))
 
 
 @cache

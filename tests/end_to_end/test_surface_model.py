@@ -159,9 +159,14 @@ def test_what_a_device_can_render_decides_how_stiff_the_coupling_is(
         assert 0.9 * 0.3 / 0.003 < stiffness < 0.3 / 0.003
         assert tip(**damped, stiffness_n_per_m=50.0)["stiffness_n_per_m"] == 50.0
         assert tip(frame={"scale": 2.0})["stiffness_n_per_m"] == pytest.approx(700.0)
-        smaller = tip(radius_m=0.004, friction=0.0)
-        assert (smaller["radius_m"], smaller["friction"]) == (0.004, 0.0)
-        assert smaller["home_m"] == pytest.approx([0.0, 0.0, 0.004])
+        smaller = tip(radius_m=0.0045, friction=0.0)
+        assert (smaller["radius_m"], smaller["friction"]) == (0.0045, 0.0)
+        assert smaller["home_m"] == pytest.approx([0.0, 0.0, 0.0045])
+        granted, answer = client.acquire("tip", radius_m=0.002)
+        assert granted
+        (warning,) = answer["warnings"]
+        assert "tool 'tip': radius_m = 0.002 touches about 0.7 points 0.003 m apart" in warning
+        assert "a radius_m of 0.0041" in warning
         for fields in (
             {"radius_m": 0.006},
             {"radius_m": 0},

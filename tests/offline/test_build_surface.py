@@ -16,6 +16,7 @@ from palpate.model_file import SurfaceModel, load_model, save_model
 from palpate.report import accuracy_text
 from palpate.scene.schema import check_config
 from palpate.scene.tissues import PRESETS
+from palpate.stage_cache import StageCache
 from palpate_server.simulation import Simulation
 
 SIDE_M, HEIGHT_M, RADIUS_M = 0.06, 0.04, 0.016
@@ -123,6 +124,7 @@ def test_the_model_is_judged_written_read_and_told(
     assert accuracy.error_static < 1e-4
     assert 0 < accuracy.error_in_band_median <= accuracy.error_in_working_area <= accuracy.error_in_band < 1
     assert accuracy.error_in_band == pytest.approx(float(accuracy.error_map.max()))
+    assert model.n_modes == 60
     assert min(accuracy.passivity_margin, accuracy.passivity_margin_sampled) >= 0
     assert not accuracy.error_map[model.held].any()
     assert np.all(accuracy.error_map[~model.held] > 0)
@@ -134,7 +136,7 @@ def test_the_model_is_judged_written_read_and_told(
     assert "322 points to touch, 60 modes" in text
     assert "never given out" in text
     assert not progress.warnings
-    assert progress.stages[-3:] == ["modes", "residual flexibility", "evidence"]
+    assert progress.stages[-4:] == ["modes", "static responses", "exact compliance", "evidence"]
 
 
 def test_a_tool_that_slides_over_an_edge_is_never_pulled_and_its_force_makes_no_jump(
@@ -202,3 +204,24 @@ def test_a_body_that_does_not_fit_is_refused_before_it_is_assembled(monkeypatch:
     ):
         build_surface_model(check_config(SCENE, "block"), Path(), progress)
     assert progress.stages == ["node cloud"]
+
+
+def test_vectors_are_added_until_the_tolerance_is_kept_and_a_second_build_takes_its_stages_from_the_cache(
+    tmp_path: Path,
+) -> None:
+    small = {
+        "geometry": SCENE["geometry"] | {"counts": [6, 6, 5]},
+        "surface": {"band_hz": [0.0, 15.0], "tolerance": 0.03},
+    }
+    config = check_config(SCENE | small, "block")
+    cache, first, second = StageCache.open(tmp_path / "cache"), _Progress(), _Progress()
+    model = build_surface_model(config, Path(), first, cache)
+    assert "Ritz vectors" in first.stages
+    assert model.accuracy.error_in_working_area <= 0.03
+    n_true = int(np.count_nonzero(model.squared_frequencies < (2 * np.pi * 16.5) ** 2))
+    assert model.n_modes > n_true + 24
+    again = build_surface_model(config, Path(), second, cache)
+    assert "Ritz vectors" not in second.stages
+    for name in ("squared_frequencies", "shapes", "residual"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(model, name))
+    assert again.accuracy.error_in_band == model.accuracy.error_in_band

@@ -53,7 +53,7 @@ def test_a_cloud_too_large_for_the_machine_is_refused_with_the_memory_it_would_t
 
 def test_a_scene_beyond_the_machine_is_refused_before_a_cloud_is_made(monkeypatch):
     config, folder = liver(0.0004)
-    monkeypatch.setattr("palpate.build.build_cloud", lambda *_: pytest.fail("a cloud is made"))
+    monkeypatch.setattr("palpate.scene_cloud.build_cloud", lambda *_: pytest.fail("a cloud is made"))
     with pytest.raises(MemoryError, match="use a coarser cloud"):
         build_model(config, folder)
 

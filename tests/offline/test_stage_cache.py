@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from palpate import build as module
+from palpate import scene_cloud
 from palpate.build import build_model
 from palpate.model_file import save_model
 from palpate.modes import body_modes
@@ -164,7 +165,7 @@ def test_a_build_that_is_killed_goes_on_and_gives_the_same_file(
     assert kept == STAGES[killed_in]
 
     config, asked = slab(slab_scene), []
-    monkeypatch.setattr(module, "build_cloud", _counted(module.build_cloud, asked))
+    monkeypatch.setattr(scene_cloud, "build_cloud", _counted(scene_cloud.build_cloud, asked))
     files = []
     for name, cache in (("resumed", StageCache.open(folder)), ("whole", NO_CACHE)):
         save_model(build_model(config, Path(), cache=cache), tmp_path / f"{name}.npz")

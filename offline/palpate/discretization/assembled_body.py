@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,10 @@ class AssembledBody:
     mass: NDArray[np.float64]
     supports: Supports
     symmetric: bool
+
+    def scaled(self, stiffness: float, mass: float) -> AssembledBody:
+        """With so many times the stiffness and the mass: from unit constants to those of a material."""
+        return replace(self, stiffness=self.stiffness * stiffness, mass=self.mass * mass)
 
     def inertia(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """(c n_nodes, k): M U = Hᵀ m H U of a symmetric body, for parameters (c n_nodes, k)."""

@@ -27,7 +27,7 @@ def force_advice(model: ReducedModel | SurfaceModel) -> list[str]:
 def _of_surface(model: SurfaceModel) -> list[str]:
     accuracy, (low, high) = model.accuracy, model.band_hz
     return [
-        f"Force {where}: wrong by {percent(error)}; raise the number of modes."
+        f"Force {where}: wrong by {percent(error)}; lower surface.tolerance."
         for error, where in (
             (accuracy.error_in_working_area, f"in {low:g}-{high:g} Hz in the working area"),
             (accuracy.error_static, "at rest"),

@@ -35,12 +35,12 @@ class SurfaceAccuracy:
     over the directions, of |force error| / |force|. Relative errors are fractions.
 
     contact_radius_m          radius of the contact, sqrt(radius * depth) (Hertz 1882)
-    error_static              largest at 0 Hz over a sample of the points, against static solutions of their own
+    error_static              largest at 0 Hz over a sample of some 200 points, against static solutions of their own
     error_static_median       the median over the sample
-    error_in_band             largest in the band over all points that are not held: a bound, before sampling
-    error_in_band_median      the median over the points
-    error_in_working_area     the largest over the points of the working areas, where tools are meant to touch
-    error_map                 (n_points,) float32: the bound at each point, 0 at held ones
+    error_in_band             largest in the band over the sample, against the assembled body; before sampling in time
+    error_in_band_median      the median over the sample
+    error_in_working_area     the largest over the sample's points in the working areas, where tools are meant to touch
+    error_map                 (n_points,) float32: the error of the nearest point of the sample, 0 at held points
     passivity_margin          smallest eigenvalue, over the points and up to half the sampling rate, of the part of w C(jw) that
                               dissipates, over |w C(0)|; 0 or above to round-off, else no model is made
     passivity_margin_sampled  the same for the displacement in a tick under a force held over it, sampled for period_s

@@ -7,23 +7,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array, kron
 from scipy.spatial import cKDTree
 
+from palpate.model_file.contact_size import contact_radius_m
+
 Array = NDArray[np.float64]
-
-DEPTH = 0.5
-"""Depth over radius of the contact. The radius of the contact is sqrt(radius * depth) (Hertz 1882)."""
-
-FEWEST_POINTS = 3.0
-"""Points in contact below which the force depends on where between the points a sphere presses."""
-
-
-def contact_radius_m(tool_radius_m: float) -> float:
-    """Radius of the contact of a sphere that is pressed in by half its radius, m."""
-    return tool_radius_m * float(np.sqrt(DEPTH))
-
-
-def points_in_contact(tool_radius_m: float, spacing_m: float) -> float:
-    """About how many points such a contact has, where a point stands for spacing²."""
-    return float(np.pi * contact_radius_m(tool_radius_m) ** 2 / spacing_m**2)
 
 
 def footprints(points: Array, normals: Array, areas: Array, tool_radius_m: float) -> csr_array:

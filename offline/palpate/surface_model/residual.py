@@ -24,18 +24,24 @@ class Residual:
     """What the modes leave out.
 
     compliance  (3 n_points, 3 n_points), R, m/N, between points; symmetric, positive semidefinite up to round-off
-    inertia     (n_points, 3, 3), R₁ = Σ p pᵀ / ω⁴ over the modes left out, p being their shapes averaged over a footprint
+    responses   (3 n_points, c n_nodes), parameters under unit forces at the points
     """
 
     compliance: Array
-    inertia: Array
+    responses: NDArray[np.float32]
+
+
+def modal_compliance(squared_frequencies: Array, shapes: Array) -> Array:
+    """(3 n_points, 3 n_points), m/N, at 0 Hz, of modes with shapes (n_points, 3, n_modes); symmetric to the last bit."""
+    scaled = (shapes / np.sqrt(squared_frequencies)).reshape(3 * len(shapes), -1)
+    return np.asarray(scaled @ scaled.T)
 
 
 def residual_memory(n_parameters: int, n_points: int, n_modes: int) -> float:
     """Bytes of `residual` at its peak."""
     compliance = 8.0 * (3 * n_points) ** 2
     responses = 4.0 * 3 * n_points * n_parameters
-    return 2 * compliance + responses + 8.0 * n_parameters * n_modes
+    return 4 * compliance + responses + 8.0 * n_parameters * n_modes
 
 
 def residual_responses(held: HeldBody, modes: LowestModes, loads: Array) -> Array:
@@ -49,18 +55,12 @@ def residual_responses(held: HeldBody, modes: LowestModes, loads: Array) -> Arra
 
 
 def residual(
-    held: HeldBody,
-    modes: LowestModes,
-    rows: csr_array,
-    free: NDArray[np.intp],
-    footprints: csr_array,
-    progress: Progress,
+    held: HeldBody, modes: LowestModes, rows: csr_array, free: NDArray[np.intp], progress: Progress
 ) -> Residual:
     """The residual at points.
 
-    rows        (n_points, n_nodes): values at the points from parameters
-    free        (n_free,): points that are not held; the others have no compliance
-    footprints  (n_points, n_points): weights of the footprint around each point
+    rows  (n_points, n_nodes): values at the points from parameters
+    free  (n_free,): points that are not held; the others have no compliance
     """
     at_points = on_components(rows)
     columns = (3 * free[:, None] + np.arange(3)).ravel()
@@ -75,20 +75,7 @@ def residual(
     held_points = np.setdiff1d(np.arange(at_points.shape[0]), columns)
     compliance[:, held_points] = 0.0
     _symmetrize(compliance)
-    return Residual(compliance, _footprint_inertia(held, responses, footprints))
-
-
-def _footprint_inertia(held: HeldBody, responses: NDArray[np.float32], footprints: csr_array) -> Array:
-    """(n_points, 3, 3): Yᵀ M Y of the responses Y to a unit force on each footprint."""
-    spread = on_components(footprints)
-    inertia = np.empty((footprints.shape[0], 3, 3))
-    for start in range(0, len(inertia), BLOCK // 3):
-        part = slice(start, start + BLOCK // 3)
-        fields = (spread[3 * part.start : 3 * part.stop] @ responses).astype(np.float64)
-        moved = held.body.inertia(np.ascontiguousarray(fields.T)).T
-        shape = (-1, 3, fields.shape[1])
-        inertia[part] = fields.reshape(shape) @ moved.reshape(shape).transpose(0, 2, 1)
-    return inertia
+    return Residual(compliance, responses)
 
 
 def _symmetrize(matrix: Array) -> None:

@@ -21,7 +21,7 @@ from palpate_server.session.devices import warnings_for
 from palpate_server.session.fields import shown
 from palpate_server.session.model_process import load_model_elsewhere
 from palpate_server.session.state import SessionState
-from palpate_server.session.tips import tips_for
+from palpate_server.session.tips import tip_warnings, tips_for
 
 log = logging.getLogger("palpate_server")
 
@@ -130,10 +130,11 @@ def accuracy_warnings(model: Model) -> list[str]:
 
 
 def warnings_of(state: SessionState, tools: Iterable[str]) -> list[str]:
-    """Warnings about the model that runs, for the devices with which these tools are rendered."""
+    """Warnings about the model that runs, for the tips of these tools and the devices that they are rendered with."""
     warnings: list[str] = []
     for name in tools:
         settings = state.leases.settings[name]
+        warnings += tip_warnings(state.model, name, settings.wanted)
         if settings.device is not None and isinstance(state.model, ReducedModel):  # others are soft enough
             index = state.tool_index[name]
             warnings += warnings_for(settings.device, state.model, index, settings.frame.scale)

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from palpate.model_file import ReducedModel
+import numpy as np
+
+from palpate.model_file import ReducedModel, SurfaceModel
+from palpate.model_file.contact_size import small_tool_advice
 from palpate_server.coupling import models
 from palpate_server.coupling.models import Model
 from palpate_server.coupling.running import Tip
@@ -15,6 +18,8 @@ from palpate_server.session.fields import TipWanted
 from palpate_server.session.leases import ToolSettings
 
 MOST_FRICTION = 2.0
+
+_NEIGHBORS = 6
 
 
 def tip_for(model: Model, name: str, wanted: TipWanted, device: Device | None, scale: float) -> Tip | None:
@@ -76,3 +81,14 @@ def tip_message(model: Model, name: str, settings: ToolSettings) -> dict[str, An
         "friction": tip.friction,
         "stiffness_n_per_m": tip.stiffness_n_per_m * scale**2,
     }
+
+
+def tip_warnings(model: Model, name: str, wanted: TipWanted) -> list[str]:
+    """What a tip that was asked for is too small for: the points of a surface model near the tool's start."""
+    if not isinstance(model, SurfaceModel) or wanted.radius_m is None:
+        return []
+    home = next(tool.home_m for tool in model.tools if tool.name == name)
+    nearest = np.argsort(np.linalg.norm(model.points - home, axis=1))[0]
+    from_there = np.sort(np.linalg.norm(model.points - model.points[nearest], axis=1))
+    text = small_tool_advice(name, wanted.radius_m, float(np.median(from_there[1 : 1 + _NEIGHBORS])))
+    return [] if text is None else [text]
