@@ -75,11 +75,8 @@ def build() -> None:
             from palpate.build import build_model
             from palpate.build_surface import build_surface_model
 
-        model = (
-            build_surface_model(scene, options.scene.parent, stages)
-            if scene.tool
-            else build_model(scene, options.scene.parent, stages, chosen_cache(options))
-        )
+        build_scene = build_surface_model if scene.tool else build_model
+        model = build_scene(scene, options.scene.parent, stages, chosen_cache(options))
         interrupts.check()
     save_model(model, path, inputs)
     seconds = time.monotonic() - start
@@ -304,14 +301,21 @@ def positive(text: str) -> float:
 
 
 def demo() -> None:
-    """Build the liver unless it is built, serve it in a second process, poke it, and draw what was felt."""
+    """Build the liver unless it is built, serve it in a second process, touch it, and draw what was felt."""
     parser = argparse.ArgumentParser(description=demo.__doc__)
+    parser.add_argument(
+        "scene",
+        type=Path,
+        nargs="?",
+        help="another scene, such as configs/liver.toml (default: a liver that a tool presses, slides over and leaves)",
+    )
     parser.add_argument(
         "--out", type=Path, default=Path("out"), help="folder for the model and the picture (%(default)s)"
     )
     parser.add_argument(
-        "--seconds", type=float, default=5.0, help="how long to poke, 1 to 600 s (%(default)g)"
+        "--seconds", type=float, default=5.0, help="how long to touch, 1 to 600 s (%(default)g)"
     )
+    add_cache_options(parser)
     parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")
     options = parser.parse_args()
     if not 1 <= options.seconds <= 600:
@@ -322,8 +326,8 @@ def demo() -> None:
             from palpate.demo import run_demo
             from palpate.report import accuracy_text
 
-        scene = Path(str(files("palpate_configs") / "liver-coarse.toml"))
-        summary = run_demo(scene, options.out, options.seconds, stages)
+        scene = options.scene or Path(str(files("palpate_configs") / "liver-demo.toml"))
+        summary = run_demo(scene, options.out, options.seconds, stages, chosen_cache(options))
     print(accuracy_text(summary.model, options.verbose), *summary.lines(), sep="\n")
 
 

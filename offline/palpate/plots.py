@@ -34,15 +34,15 @@ class Touch:
     force_n: Array
     force_full_n: Array
 
-    def in_band(self, signal: Array, model: ReducedModel) -> Array:
-        """The part of a signal (n_ticks, k) within the model's haptic band, without delay."""
-        low, high = model.accuracy.band_hz
-        rate = 1 / model.period_s
-        if low == 0:
-            filter_ = butter(4, high, "lowpass", fs=rate, output="sos")
-        else:
-            filter_ = butter(4, (low, high), "bandpass", fs=rate, output="sos")
-        return np.asarray(sosfiltfilt(filter_, signal, axis=0))
+
+def in_band(signal: Array, band_hz: tuple[float, float], period_s: float) -> Array:
+    """The part of a signal (n_ticks, k) within a band, without delay."""
+    low, high = band_hz
+    if low == 0:
+        filter_ = butter(4, high, "lowpass", fs=1 / period_s, output="sos")
+    else:
+        filter_ = butter(4, (low, high), "bandpass", fs=1 / period_s, output="sos")
+    return np.asarray(sosfiltfilt(filter_, signal, axis=0))
 
 
 def require_matplotlib() -> None:
@@ -89,7 +89,11 @@ def draw_touch(model: ReducedModel, touch: Touch, path: Path) -> None:
     difference = touch.force_n - touch.force_full_n
     for values, style, label in (
         (difference, {"color": "0.75", "linewidth": 0.6}, "every frequency"),
-        (touch.in_band(difference, model), {"color": "tab:blue"}, f"below {model.accuracy.band_hz[1]:g} Hz"),
+        (
+            in_band(difference, model.accuracy.band_hz, model.period_s),
+            {"color": "tab:blue"},
+            f"below {model.accuracy.band_hz[1]:g} Hz",
+        ),
     ):
         error = np.linalg.norm(values, axis=1) / largest
         axes[2].semilogy(touch.time_s, np.maximum(error, 1e-6), label=label, **style)

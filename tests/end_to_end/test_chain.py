@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.lti.stepping import step_through
 from palpate.model_file import ReducedModel, load_model
-from palpate.plots import Touch
+from palpate.plots import Touch, in_band
 from palpate_client.local_server import free_endpoint
 from palpate_client.wire import RECORDER
 
@@ -108,13 +108,14 @@ def test_the_served_force_is_the_full_models_within_the_error_that_the_file_stat
     scale = np.repeat(poke.channels("force_scale"), 3, axis=1)
     touch = Touch(time, displacement, force, -scale * full.response(displacement, model.period_s))
     steady = np.all(touch.force_n[:, 3:] != 0, axis=1)  # a contact that nobody holds gives no force
-    difference = touch.in_band((touch.force_n - touch.force_full_n)[:, 3:] * steady[:, None], model)
+    steady_difference = (touch.force_n - touch.force_full_n)[:, 3:] * steady[:, None]
+    difference = in_band(steady_difference, model.accuracy.band_hz, model.period_s)
     frequencies = np.fft.rfftfreq(len(touch.time_s), model.period_s)
     spectrum = np.fft.rfft(touch.displacement_m, axis=0)
-    in_band = frequencies <= model.accuracy.band_hz[1]
-    gain = np.linalg.norm(full.transfer(2j * np.pi * frequencies[in_band]), 2, axis=(1, 2))
-    felt = gain * np.linalg.norm(spectrum[in_band], axis=1)
-    weights = np.where(frequencies[in_band] == 0, 1.0, 2.0)  # both signs of the frequency
+    inside = frequencies <= model.accuracy.band_hz[1]
+    gain = np.linalg.norm(full.transfer(2j * np.pi * frequencies[inside]), 2, axis=(1, 2))
+    felt = gain * np.linalg.norm(spectrum[inside], axis=1)
+    weights = np.where(frequencies[inside] == 0, 1.0, 2.0)  # both signs of the frequency
     energy = np.sum(weights * felt**2) / len(touch.time_s)
     assert np.sum(difference**2) <= model.accuracy.error_in_band**2 * energy
 
