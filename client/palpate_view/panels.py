@@ -1,0 +1,186 @@
+"""The controls and charts beside the picture. They last for as long as the page; a model fills them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser import uplot
+
+from palpate_view import colors
+from palpate_view.history import SHOWN_S
+
+PRESS, GRAB = "Press and slide", "Hold and pull"
+DISPLACEMENT, ERROR, NO_COLOR = "Displacement", "Error of the model", "None"
+RECORD, STOP = "Record", "Stop recording"
+
+_AXIS = "#8a919c"
+_GRID = "rgba(138, 145, 156, 0.18)"
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a chart: a column of `History.columns`, its label, its color, and what to multiply it with."""
+
+    column: str
+    label: str
+    color: str
+    factor: float = 1.0
+
+
+class Chart:
+    """Lines over the last seconds."""
+
+    def __init__(self, gui: viser.GuiApi, title: str, lines: Sequence[Line], height: int = 170) -> None:
+        self._lines = lines
+        nothing = (np.array([-SHOWN_S, 0.0]), *(np.zeros(2) for _ in lines))
+        axis = uplot.Axis(
+            stroke=_AXIS, grid=uplot.Axis_Grid(stroke=_GRID, width=1), ticks=uplot.Axis_Ticks(show=False)
+        )
+        self._chart = gui.add_uplot(
+            nothing,
+            (
+                uplot.Series(label="s"),
+                *(uplot.Series(label=line.label, stroke=line.color, width=1.6) for line in lines),
+            ),
+            title=title,
+            scales={"x": uplot.Scale(time=False, range=(-SHOWN_S, 0.0))},
+            axes=(uplot.Axis(**axis, size=26), uplot.Axis(**axis, size=44)),
+            legend=uplot.Legend(show=len(lines) > 1),
+            height=height + (22 * ((len(lines) + 1) // 2) if len(lines) > 1 else 0),
+        )  # fmt: skip
+
+    def draw(self, columns: dict[str, NDArray[np.float64]]) -> None:
+        if len(columns["time_s"]) > 1:
+            self._chart.data = (
+                columns["time_s"],
+                *(columns[line.column] * line.factor for line in self._lines),
+            )
+
+
+class Panels:
+    """The panel of controls, docked at the right, and that of charts, docked at the left; sheets on a phone."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self.readout = gui.add_html("")
+        with gui.add_folder("Touch"):
+            self.pointer = gui.add_dropdown(
+                "Pointer",
+                (PRESS, GRAB),
+                hint="What dragging on the organ does. The tool itself can be dragged too.",
+            )
+            self.depth = gui.add_slider("Press, mm", 0.0, 15.0, 0.5, 5.0)
+            self.tool = gui.add_dropdown("Tool", ("-",), visible=False)
+            self.radius = gui.add_slider("Radius, mm", 0.5, 10.0, 0.1, 5.0, visible=False)
+            self.friction = gui.add_slider("Friction", 0.0, 2.0, 0.05, 0.3, visible=False)
+        with gui.add_folder("Colors"):
+            self.color = gui.add_dropdown("Show", (DISPLACEMENT, NO_COLOR))
+            self.legend = gui.add_html("")
+        with gui.add_folder("Session"):
+            self.model = gui.add_text(
+                "Model file", "", hint="Name of a file in the server's folder of models"
+            )
+            self.load = gui.add_button("Load")
+            self.record = gui.add_button(RECORD, icon=viser.Icon.PLAYER_RECORD)
+            self.session = gui.add_html("")
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(310)
+        charts = gui.add_panel()
+        with charts.add_tab("Charts", viser.Icon.CHART_LINE):
+            self._charts = [
+                Chart(gui, "Force, N", [Line("force_n", "force", "#46c8ff")], 150),
+                Chart(gui, "Depth, mm", [Line("depth_m", "depth", "#ffb454", 1e3)], 150),
+                Chart(
+                    gui,
+                    "Energy, mJ",
+                    [
+                        Line("work_j", "work of the tool", "#e8ecf1", 1e3),
+                        Line("tissue_j", "in the tissue", "#ff7a70", 1e3),
+                        Line("lost_j", "lost", "#9aa5b1", 1e3),
+                        Line("spring_j", "in the spring", "#7ee081", 1e3),
+                        Line("withheld_j", "withheld", "#c792ea", 1e3),
+                    ],
+                    170,
+                ),
+                Chart(
+                    gui,
+                    "Timing, ms",
+                    [
+                        Line("input_age_s", "input age", "#46c8ff", 1e3),
+                        Line("lateness_s", "tick lateness", "#ffb454", 1e3),
+                    ],
+                    150,
+                ),
+            ]
+        charts.dock_left()
+        charts.set_width(310)
+
+    def draw_charts(self, columns: dict[str, NDArray[np.float64]]) -> None:
+        for chart in self._charts:
+            chart.draw(columns)
+
+    def fill(self, radii_m: dict[str, float], friction: float | None) -> None:
+        """Show what the tools of a model, by name, can be asked for. `friction` is the model's, None for patches."""
+        self.tool.options = tuple(radii_m)
+        _set(self.tool, next(iter(radii_m)))
+        self.tool.visible = len(radii_m) > 1
+        self.radius.visible = self.friction.visible = friction is not None
+        if friction is not None:
+            largest_mm = 1e3 * max(radii_m.values())
+            self.radius.min, self.radius.step, self.radius.max = largest_mm / 5, largest_mm / 50, largest_mm
+            _set(self.radius, 1e3 * next(iter(radii_m.values())))
+            _set(self.friction, friction)
+
+    def radius_m(self) -> float:
+        return 1e-3 * float(self.radius.value)
+
+    def show_recording(self, runs: bool) -> None:
+        self.record.label = STOP if runs else RECORD
+        self.record.color = "red" if runs else None
+
+
+def _set(handle: Any, value: object) -> None:
+    """Set the value of a control; mypy does not see that viser's property can be set."""
+    handle.value = value
+
+
+def readout_html(force_n: float, depth_m: float, words: str, good: bool) -> str:
+    """The numbers that a person looks at while touching, and one line of words."""
+
+    def number(value: str, unit: str, name: str) -> str:
+        return (
+            f'<div style="flex:1"><div style="font-size:1.9em;font-weight:600;line-height:1.1;font-variant-numeric:tabular-nums">'
+            f'{value}<span style="font-size:0.5em;font-weight:400;opacity:0.7"> {unit}</span></div>'
+            f'<div style="font-size:0.8em;opacity:0.65">{name}</div></div>'
+        )
+
+    dot = "#7ee081" if good else "#ffb454"
+    return (
+        f'<div style="padding:0.6em 0.9em 0.2em 0.9em"><div style="display:flex;gap:0.8em">'
+        f"{number(f'{force_n:.2f}', 'N', 'force')}{number(f'{1e3 * depth_m:.1f}', 'mm', 'depth')}</div>"
+        f'<div style="margin-top:0.5em;font-size:0.85em"><span style="color:{dot}">&#9679;</span> {words}</div></div>'
+    )
+
+
+def legend_html(largest: str, unit: str) -> str:
+    """The bar of colors from 0 to the largest value."""
+    stops = ", ".join(f"rgb{colors.color_at(i / 10)}" for i in range(11))
+    return (
+        f'<div style="padding:0.2em 0.9em 0.5em 0.9em;font-size:0.8em"><div style="height:0.7em;border-radius:0.35em;'
+        f'background:linear-gradient(90deg,{stops})"></div><div style="display:flex;justify-content:space-between;'
+        f'opacity:0.75;margin-top:0.2em"><span>0</span><span>{largest} {unit}</span></div></div>'
+    )
+
+
+def session_html(lines: Sequence[tuple[str, str]]) -> str:
+    """Names and values, one a line."""
+    rows = "".join(
+        f'<div style="display:flex;justify-content:space-between;gap:1em"><span style="opacity:0.65">{name}</span>'
+        f'<span style="text-align:right;font-variant-numeric:tabular-nums">{value}</span></div>'
+        for name, value in lines
+    )
+    return f'<div style="padding:0.2em 0.9em 0.6em 0.9em;font-size:0.8em;line-height:1.5">{rows}</div>'
