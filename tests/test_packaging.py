@@ -50,7 +50,9 @@ def needs(extra: str) -> set[str]:
 def test_a_plain_installation_is_a_client() -> None:
     assert needs("") == {"eclipse-zenoh", "msgpack"}
     assert needs("server") == {"numpy", "numba"}
-    assert needs("all") >= needs("build") | needs("plots") | needs("recorder") | needs("metrics") | needs("view")
+    assert needs("all") >= needs("build") | needs("plots") | needs("recorder") | needs("metrics") | needs(
+        "view"
+    )
     assert {c.extra for c in COMMANDS.values()} <= {
         "",
         "server",

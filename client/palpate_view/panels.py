@@ -20,6 +20,8 @@ RECORD, STOP = "Record", "Stop recording"
 
 _AXIS = "#8a919c"
 _GRID = "rgba(138, 145, 156, 0.18)"
+# uPlot's words for: the axis fits the data with a margin, but shows 0 and 0.2 always.
+_FROM_ZERO = {"min": {"pad": 0.1, "soft": 0, "mode": 1}, "max": {"pad": 0.1, "soft": 0.2, "mode": 1}}
 
 
 @dataclass(frozen=True)
@@ -32,10 +34,35 @@ class Line:
     factor: float = 1.0
 
 
-class Chart:
-    """Lines over the last seconds."""
+_CHARTS = (
+    ("Force, N", 125, [Line("force_n", "", "#46c8ff")]),
+    ("Depth, mm", 125, [Line("depth_m", "", "#ffb454", 1e3)]),
+    (
+        "Energy, mJ",
+        165,
+        [
+            Line("work_j", "work of the tool", "#e8ecf1", 1e3),
+            Line("tissue_j", "in the tissue", "#ff7a70", 1e3),
+            Line("lost_j", "lost", "#8fa1b3", 1e3),
+            Line("spring_j", "in the spring", "#7ee081", 1e3),
+            Line("withheld_j", "withheld", "#c792ea", 1e3),
+        ],
+    ),
+    (
+        "Timing, ms",
+        125,
+        [
+            Line("input_age_s", "input age", "#46c8ff", 1e3),
+            Line("lateness_s", "tick lateness", "#ffb454", 1e3),
+        ],
+    ),
+)
 
-    def __init__(self, gui: viser.GuiApi, title: str, lines: Sequence[Line], height: int = 170) -> None:
+
+class Chart:
+    """Lines over the last seconds, and what they are."""
+
+    def __init__(self, gui: viser.GuiApi, title: str, lines: Sequence[Line], height: int) -> None:
         self._lines = lines
         nothing = (np.array([-SHOWN_S, 0.0]), *(np.zeros(2) for _ in lines))
         axis = uplot.Axis(
@@ -47,12 +74,13 @@ class Chart:
                 uplot.Series(label="s"),
                 *(uplot.Series(label=line.label, stroke=line.color, width=1.6) for line in lines),
             ),
-            title=title,
-            scales={"x": uplot.Scale(time=False, range=(-SHOWN_S, 0.0))},
-            axes=(uplot.Axis(**axis, size=26), uplot.Axis(**axis, size=44)),
-            legend=uplot.Legend(show=len(lines) > 1),
-            height=height + (22 * ((len(lines) + 1) // 2) if len(lines) > 1 else 0),
-        )  # fmt: skip
+            scales={"x": uplot.Scale(time=False, range=(-SHOWN_S, 0.0)), "y": uplot.Scale(range=_FROM_ZERO)},
+            axes=(uplot.Axis(**axis, size=24), uplot.Axis(**axis, size=46)),
+            legend=uplot.Legend(show=False),
+            height=height,
+            padding=(10, 14, 0, 0),
+        )
+        gui.add_html(chart_legend_html(title, lines))
 
     def draw(self, columns: dict[str, NDArray[np.float64]]) -> None:
         if len(columns["time_s"]) > 1:
@@ -91,31 +119,7 @@ class Panels:
         gui.main_panel.set_width(310)
         charts = gui.add_panel()
         with charts.add_tab("Charts", viser.Icon.CHART_LINE):
-            self._charts = [
-                Chart(gui, "Force, N", [Line("force_n", "force", "#46c8ff")], 150),
-                Chart(gui, "Depth, mm", [Line("depth_m", "depth", "#ffb454", 1e3)], 150),
-                Chart(
-                    gui,
-                    "Energy, mJ",
-                    [
-                        Line("work_j", "work of the tool", "#e8ecf1", 1e3),
-                        Line("tissue_j", "in the tissue", "#ff7a70", 1e3),
-                        Line("lost_j", "lost", "#9aa5b1", 1e3),
-                        Line("spring_j", "in the spring", "#7ee081", 1e3),
-                        Line("withheld_j", "withheld", "#c792ea", 1e3),
-                    ],
-                    170,
-                ),
-                Chart(
-                    gui,
-                    "Timing, ms",
-                    [
-                        Line("input_age_s", "input age", "#46c8ff", 1e3),
-                        Line("lateness_s", "tick lateness", "#ffb454", 1e3),
-                    ],
-                    150,
-                ),
-            ]
+            self._charts = [Chart(gui, title, lines, height) for title, height, lines in _CHARTS]
         charts.dock_left()
         charts.set_width(310)
 
@@ -163,6 +167,19 @@ def readout_html(force_n: float, depth_m: float, words: str, good: bool) -> str:
         f'<div style="padding:0.6em 0.9em 0.2em 0.9em"><div style="display:flex;gap:0.8em">'
         f"{number(f'{force_n:.2f}', 'N', 'force')}{number(f'{1e3 * depth_m:.1f}', 'mm', 'depth')}</div>"
         f'<div style="margin-top:0.5em;font-size:0.85em"><span style="color:{dot}">&#9679;</span> {words}</div></div>'
+    )
+
+
+def chart_legend_html(title: str, lines: Sequence[Line]) -> str:
+    """A chart's title, and each line's color and name."""
+    names = "".join(
+        f'<span style="white-space:nowrap"><span style="color:{line.color}">&#9644;</span> {line.label}</span>'
+        for line in lines
+        if line.label
+    )
+    return (
+        '<div style="display:flex;flex-wrap:wrap;gap:0.1em 0.8em;padding:0 1em 0.5em 1em;font-size:0.8em;line-height:1.4">'
+        f'<span style="font-weight:600">{title}</span>{names}</div>'
     )
 
 

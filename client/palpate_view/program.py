@@ -28,7 +28,6 @@ from palpate_view.session import Session
 DEFAULT_PORT = 8080
 RETRY_S = 1.0
 _TOLD_S = 6.0
-_BACKGROUND_INTENSITY = 0.55
 
 
 class Page(viser.ViserServer):
@@ -47,7 +46,6 @@ class View:
         self.page.gui.configure_theme(
             dark_mode=True, show_logo=False, show_share_button=False, brand_color=(70, 150, 200)
         )
-        self.page.scene.configure_environment_map("studio", environment_intensity=_BACKGROUND_INTENSITY)
         self.panels = Panels(self.page.gui)
         self.session: Session | None = None
         self.page.on_client_connect(self._opened)

@@ -21,7 +21,9 @@ SCENE_PER_M = 10.0
 _ARROW_LENGTH = 0.35  # of the organ's size, for a newton
 _LONGEST_ARROW = 0.9  # of the organ's size
 _SMALLEST_FORCE_N = 0.01
+_STILL_M = 2e-5  # displacements that change by less look the same
 _GHOST_GAP_M = 2e-4  # a ghost that is nearer to the tool is not shown
+_ROUND = 10  # subdivisions of a sphere
 _SHAFT = 0.4  # of the organ's size
 _LIFT = 4e-4  # of the organ's size: so far the colors are above the tissue
 _UP = np.array([0.0, 0.0, 1.0])
@@ -47,14 +49,12 @@ class Scene:
         )
         nothing, no_face = np.zeros((3, 3)), np.array([[0, 1, 2]])
         self._bands = [
-            api.add_mesh_simple(
-                f"/bands/{i}", nothing, no_face, color=color, side="double", cast_shadow=False, visible=False
-            )
+            api.add_mesh_simple(f"/bands/{i}", nothing, no_face, color=color, side="double", visible=False)
             for i, color in enumerate(colors.band_colors())
         ]
-        self._tool = api.add_icosphere("/tool", 1.0, colors.STEEL, subdivisions=4)
+        self._tool = api.add_icosphere("/tool", 1.0, colors.STEEL, subdivisions=_ROUND)
         self._shaft = api.add_cylinder("/shaft", 0.28, 1.0, colors.STEEL)
-        self._ghost = api.add_icosphere("/ghost", 1.0, colors.GHOST, opacity=0.35, cast_shadow=False)
+        self._ghost = api.add_icosphere("/ghost", 1.0, colors.GHOST, opacity=0.35, subdivisions=_ROUND)
         self._contact = api.add_point_cloud(
             "/contact", np.zeros((1, 3)), colors.CONTACT, point_size=0.008 * size, point_shape="circle",
             point_shading="gradient", precision="float32",
@@ -66,6 +66,8 @@ class Scene:
         self._label = api.add_label("/force_label", "", anchor="bottom-center", font_screen_scale=1.3)
         for node in (self._ghost, self._contact, self._force, self._label):
             node.visible = False
+        self._drawn = np.full_like(vertices, np.nan, np.float32)  # the displacement that is seen
+        self._drawn_scale: tuple[bool, float] | None = None
 
     def on_drag(self, organ: Drag, tool: Drag) -> None:
         """Call organ(event) and tool(event) for each of viser's drag events on them."""
@@ -73,8 +75,17 @@ class Scene:
         for node in (self._tool, self._shaft):
             node.on_drag("left")(tool)
 
-    def draw_organ(self, displacement: NDArray[np.float32], values: Floats | None, largest: float) -> None:
-        """The organ with a displacement (n, 3), m; colors for `values` (n,) from 0 to `largest`, or none."""
+    def draw_organ(
+        self, displacement: NDArray[np.float32], values: NDArray[np.float32] | None, largest: float
+    ) -> None:
+        """The organ with a displacement (n, 3), m; colors for `values` (n,) from 0 to `largest`, or none.
+
+        Nothing is sent while nothing is seen to move.
+        """
+        scale = (values is not None, largest)
+        if scale == self._drawn_scale and np.abs(displacement - self._drawn).max() < _STILL_M:
+            return
+        self._drawn, self._drawn_scale = displacement.copy(), scale
         moved = self.vertices + displacement
         self._organ.vertices = (SCENE_PER_M * moved).astype(np.float32)
         if values is None:
@@ -128,16 +139,50 @@ def rotation_to(axis: Floats) -> tuple[float, float, float, float]:
     return w, -y / (2 * w), x / (2 * w), 0.0
 
 
-def camera_position(center_m: Floats, size_m: float, normal: Floats, aspect: float, fov_rad: float) -> Floats:
-    """(3,), m: from where the organ fills the picture: obliquely before the tool, whose normal is `normal` (3,), and above it.
-
-    aspect: width over height; fov_rad: vertical field of view.
-    """
+def view_from(normal: Floats) -> Floats:
+    """(3,), of length 1: obliquely before a tool with a normal (3,), and from above."""
     level = normal - (normal @ _UP) * _UP
     if np.linalg.norm(level) < 0.3:  # the tool comes from above or from below
         level = np.array([0.0, -1.0, 0.0])
     level /= np.linalg.norm(level)
-    side = np.cross(_UP, level)
-    direction = 0.80 * level + 0.45 * side + 0.62 * _UP
+    direction = 0.80 * level + 0.40 * np.cross(_UP, level) + 0.55 * _UP
+    return direction / float(np.linalg.norm(direction))
+
+
+def camera_position(center_m: Floats, size_m: float, normal: Floats, aspect: float, fov_rad: float) -> Floats:
+    """(3,), m: from where the organ fills the picture, along `view_from`.
+
+    aspect: width over height; fov_rad: vertical field of view.
+    """
     half = math.atan(math.tan(fov_rad / 2) * min(1.0, aspect))
-    return center_m + direction / np.linalg.norm(direction) * (0.52 * size_m / math.sin(half))
+    return center_m + view_from(normal) * (0.62 * size_m / math.sin(half))
+
+
+def light(api: viser.SceneApi, normal: Floats) -> None:
+    """Light from the camera's left, a weaker one from its right, and one from behind that draws the outline. No shadows.
+
+    Shadows and pictures of surroundings would cost a phone more than all the rest.
+    """
+    api.configure_default_lights(False)
+    api.configure_environment_map(None)
+    front = view_from(normal)
+    right = np.cross(_UP, front)
+    right /= np.linalg.norm(right)
+    api.add_light_hemisphere(
+        "/light/sky", sky_color=(205, 220, 255), ground_color=(110, 85, 80), intensity=1.0
+    )
+    for name, direction, color, intensity in (
+        ("key", front - 0.9 * right + 0.9 * _UP, (255, 244, 232), 2.3),
+        ("fill", front + 1.2 * right + 0.1 * _UP, (200, 215, 255), 0.7),
+        ("rim", -front + 0.3 * right + 0.8 * _UP, (255, 255, 255), 1.6),
+    ):
+        api.add_light_directional(
+            f"/light/{name}", color=color, intensity=intensity, position=tuple(30.0 * direction)
+        )
+
+
+def background() -> NDArray[np.uint8]:
+    """(256, 4, 3): a picture that gets lighter from the bottom upwards."""
+    shade = np.linspace(1.0, 0.0, 256)[:, None, None]
+    bottom, top = np.array([14.0, 17.0, 22.0]), np.array([46.0, 55.0, 68.0])
+    return np.broadcast_to(bottom + shade * (top - bottom), (256, 4, 3)).astype(np.uint8)

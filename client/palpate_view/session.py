@@ -20,7 +20,7 @@ from palpate_view.frames import ToolState, tool_state
 from palpate_view.hand import Grip, Hand
 from palpate_view.motion import Floats, Gesture
 from palpate_view.panels import DISPLACEMENT, GRAB, Panels, legend_html, readout_html, session_html
-from palpate_view.scene import SCENE_PER_M, Scene, camera_position
+from palpate_view.scene import SCENE_PER_M, Scene, background, camera_position, light
 from palpate_view.surface import Hit, Triangles, ray_hit, touched_points
 from palpate_view.watch import Watch
 
@@ -58,6 +58,8 @@ class Session:
         self._axis = np.asarray(description.tools[0].normal, float)  # of the tool's shaft
         self._largest_m = _SMALLEST_SCALE_M
         page.scene.reset()
+        light(page.scene, self._normal())
+        page.scene.set_background_image(background(), "png")
         self._scene = Scene(page.scene, *surface_at_rest(connection.geometry()))
         self._scene.on_drag(self._on_organ, self._on_tool)
         described = description.message["tools"]
@@ -98,7 +100,7 @@ class Session:
         position = camera_position(scene.center_m, scene.size_m, self._normal(), camera.aspect, camera.fov)
         camera.up_direction = (0.0, 0.0, 1.0)
         camera.position = SCENE_PER_M * position
-        camera.look_at = SCENE_PER_M * scene.center_m
+        camera.look_at = SCENE_PER_M * (scene.center_m + 0.06 * scene.size_m * self._normal())
 
     def page_closed(self, page: int) -> None:
         self._hand.let_go(page)
