@@ -45,13 +45,13 @@ class History:
         self._age_s = self._late_s = 0.0
 
     def add(self, force: Force, tissue_stored_j: float, tissue_dissipated_j: float) -> None:
-        """One tick. A tool that sends no commands has no input age; its time is left out."""
+        """One tick. The input age of a tool without commands is 0."""
         last = self._last
         if last is not None:
             elapsed_s = (force.server_time_ns - last.server_time_ns) * 1e-9
             self._late_s = max(self._late_s, elapsed_s - (force.tick - last.tick) * self.period_s)
         self._last = force
-        self._age_s = max(self._age_s, force.input_age_ns * 1e-9)
+        self._age_s = max(self._age_s, force.input_age_ns * 1e-9, 0.0)
         if force.tick % BIN_TICKS:
             return
         touch = force.touch
@@ -64,7 +64,7 @@ class History:
             tissue_dissipated_j + touch.dissipated_j,
             touch.stored_j,
             touch.withheld_j,
-            self._age_s if force.input_age_ns >= 0 else math.nan,
+            self._age_s,
             self._late_s,
         )
         self._age_s = self._late_s = 0.0

@@ -15,7 +15,7 @@ from palpate_view import colors
 from palpate_view.history import SHOWN_S
 
 PRESS, GRAB = "Press and slide", "Hold and pull"
-DISPLACEMENT, ERROR, NO_COLOR = "Displacement", "Error of the model", "None"
+DISPLACEMENT, ERROR, NO_COLOR = "Displacement", "Error of the model in its band", "None"
 RECORD, STOP = "Record", "Stop recording"
 
 _AXIS = "#8a919c"
@@ -127,8 +127,9 @@ class Panels:
         for chart in self._charts:
             chart.draw(columns)
 
-    def fill(self, radii_m: dict[str, float], friction: float | None) -> None:
+    def fill(self, radii_m: dict[str, float], friction: float | None, *, has_error: bool) -> None:
         """Show what the tools of a model, by name, can be asked for. `friction` is the model's, None for patches."""
+        self.color.options = (DISPLACEMENT, ERROR, NO_COLOR) if has_error else (DISPLACEMENT, NO_COLOR)
         self.tool.options = tuple(radii_m)
         _set(self.tool, next(iter(radii_m)))
         self.tool.visible = len(radii_m) > 1
@@ -183,13 +184,13 @@ def chart_legend_html(title: str, lines: Sequence[Line]) -> str:
     )
 
 
-def legend_html(largest: str, unit: str) -> str:
+def legend_html(largest: str) -> str:
     """The bar of colors from 0 to the largest value."""
     stops = ", ".join(f"rgb{colors.color_at(i / 10)}" for i in range(11))
     return (
         f'<div style="padding:0.2em 0.9em 0.5em 0.9em;font-size:0.8em"><div style="height:0.7em;border-radius:0.35em;'
         f'background:linear-gradient(90deg,{stops})"></div><div style="display:flex;justify-content:space-between;'
-        f'opacity:0.75;margin-top:0.2em"><span>0</span><span>{largest} {unit}</span></div></div>'
+        f'opacity:0.75;margin-top:0.2em"><span>0</span><span>{largest}</span></div></div>'
     )
 
 

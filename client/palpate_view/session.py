@@ -19,15 +19,15 @@ from palpate_view.colors import nice_ceiling
 from palpate_view.frames import ToolState, tool_state
 from palpate_view.hand import Grip, Hand
 from palpate_view.motion import Floats, Gesture
-from palpate_view.panels import DISPLACEMENT, GRAB, Panels, legend_html, readout_html, session_html
+from palpate_view.panels import DISPLACEMENT, ERROR, GRAB, Panels, legend_html, readout_html, session_html
 from palpate_view.scene import SCENE_PER_M, Scene, background, camera_position, light
 from palpate_view.surface import Hit, Triangles, ray_hit, touched_points
 from palpate_view.watch import Watch
 
 FRAME_PERIOD_S = 1 / 30
-CHART_PERIOD_S = 0.1
+CHART_PERIOD_S = 0.2
 PULSE_S = 0.1  # pause between two questions to the page that drags
-_PULSE_TIMEOUT_S = 1.0
+_PULSE_TIMEOUT_S = 2.0
 _SMALLEST_SCALE_M = 1e-3
 _SCALE_HALF_LIFE_S = 4.0  # of the colors' largest value, after the tissue has moved less
 _PATCH_SPHERE = 0.4  # of the patch's radius: of the sphere that is drawn for its tool
@@ -60,12 +60,16 @@ class Session:
         page.scene.reset()
         light(page.scene, self._normal())
         page.scene.set_background_image(background(), "png")
-        self._scene = Scene(page.scene, *surface_at_rest(connection.geometry()))
+        geometry = connection.geometry()
+        self._scene = Scene(page.scene, *surface_at_rest(geometry))
+        error = geometry.error_in_band
+        self._error = None if error is None else np.frombuffer(error, np.float32)
         self._scene.on_drag(self._on_organ, self._on_tool)
         described = description.message["tools"]
         panels.fill(
             {tool["name"]: tool["radius_m"] for tool in described},
             described[0]["friction"] if self._anywhere else None,
+            has_error=self._error is not None,
         )
         for client in page.get_clients().values():
             self.frame_organ(client)
@@ -116,8 +120,8 @@ class Session:
         length = np.linalg.norm(surface, axis=1)
         fading = 0.5 ** (FRAME_PERIOD_S / _SCALE_HALF_LIFE_S)
         self._largest_m = max(float(length.max()), self._largest_m * fading, _SMALLEST_SCALE_M)
-        colored = self._panels.color.value == DISPLACEMENT
-        self._scene.draw_organ(surface, length if colored else None, nice_ceiling(self._largest_m))
+        values, largest = self._colors(length)
+        self._scene.draw_organ(surface, values, largest)
         self._turn_axis()
         radius_m = self._radius_m(tool)
         if self._anywhere:
@@ -142,10 +146,32 @@ class Session:
         words, good = self._words(force.flags)
         newtons = float(np.linalg.norm(state.force_n))
         self._panels.readout.content = readout_html(newtons, force.touch.penetration_m, words, good)
-        self._panels.legend.content = legend_html(f"{1e3 * nice_ceiling(self._largest_m):g}", "mm")
+        self._panels.legend.content = self._legend()
         self._panels.session.content = session_html(self._facts(status))
         recording = status["recording"] is not None
         self._panels.show_recording(recording)
+
+    def _colors(self, length: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, float]:
+        """What the colors show, (n,), and its largest value; `length` (n,) is that of the displacement, m."""
+        shown = self._panels.color.value
+        if shown == DISPLACEMENT:
+            return length, nice_ceiling(self._largest_m)
+        if shown == ERROR and self._error is not None:
+            return self._error, self._largest_error()
+        return None, 1.0
+
+    def _legend(self) -> str:
+        shown = self._panels.color.value
+        if shown == DISPLACEMENT:
+            return legend_html(f"{1e3 * nice_ceiling(self._largest_m):g} mm")
+        if shown == ERROR and self._error is not None:
+            return legend_html(f"{100 * self._largest_error():g} % and more")
+        return ""
+
+    def _largest_error(self) -> float:
+        """Nearly the largest of the map: supports, where it is largest by far, leave no colors for the rest."""
+        assert self._error is not None
+        return nice_ceiling(max(float(np.quantile(self._error, 0.95)), 1e-4))
 
     def _words(self, flags: int) -> tuple[str, bool]:
         """What the tool does, in a few words, and whether all is well."""
