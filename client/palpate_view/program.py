@@ -72,6 +72,8 @@ class View:
             client.add_notification("palpate", text, auto_close_seconds=_TOLD_S)
 
     async def _opened(self, client: viser.ClientHandle) -> None:
+        if client.camera.aspect < 1.0:  # on a phone the controls would cover the organ
+            client.gui.main_panel.minimize()
         if self.session is not None:
             self.session.frame_organ(client)
 
