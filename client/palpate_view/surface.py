@@ -107,14 +107,14 @@ def split(
 
 
 def bands(
-    vertices: Floats, triangles: Triangles, values: Floats, levels: Floats
+    vertices: Floats, triangles: Triangles, values: Floats | NDArray[np.float32], levels: Floats
 ) -> list[tuple[NDArray[np.float32], NDArray[np.uint32]]]:
     """The parts of a surface between one level and the next, as (vertices (k, 3), triangles (j, 3)); the last one has no end.
 
     values (n,) at the vertices (n, 3); levels ascending. What is below the first level is left out.
     """
     used = triangles[(values[triangles] > levels[0]).any(axis=1)]
-    rest = split(vertices[used], values[used], float(levels[0]))[1]
+    rest = split(vertices[used], values[used].astype(float), float(levels[0]))[1]
     found = []
     for level in levels[1:]:
         band, rest = split(*rest, float(level))
