@@ -38,7 +38,7 @@ FIGURES = ("tick_lateness_s", "compute_time_s")
 DEPTH_M = 0.005  # the page's own
 EVENT_S = 0.05  # between two events of a pointer
 FLAGS = (
-    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
+    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing", "--disable-gpu-rasterization", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
 
@@ -143,7 +143,7 @@ def chromium(folder: Path) -> Iterator[Callable[[], Page]]:
     nice.chmod(0o755)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=nice, args=list(FLAGS))
-        yield lambda: browser.new_page(viewport={"width": 1280, "height": 800})
+        yield lambda: browser.new_page(viewport={"width": 1040, "height": 600})
         browser.close()
 
 

@@ -17,7 +17,7 @@ from palpate_client import ClientError, Connection, Tool
 from palpate_view.motion import Floats, Gesture, Motion, at_home, follow
 
 COMMAND_PERIOD_S = 0.004
-LONGEST_SILENCE_S = 1.0  # of the page: also a browser that draws in software answers sooner
+LONGEST_SILENCE_S = 2.0  # of the page: also a browser that draws in software on a busy machine answers sooner
 
 
 @dataclass(frozen=True)

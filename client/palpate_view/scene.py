@@ -155,7 +155,7 @@ def camera_position(center_m: Floats, size_m: float, normal: Floats, aspect: flo
     aspect: width over height; fov_rad: vertical field of view.
     """
     half = math.atan(math.tan(fov_rad / 2) * min(1.0, aspect))
-    return center_m + view_from(normal) * (0.62 * size_m / math.sin(half))
+    return center_m + view_from(normal) * (0.54 * size_m / math.sin(half))
 
 
 def light(api: viser.SceneApi, normal: Floats) -> None:

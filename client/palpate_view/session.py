@@ -17,7 +17,7 @@ from palpate_client.wire import RECORDER, Flags
 from palpate_view import motion
 from palpate_view.colors import nice_ceiling
 from palpate_view.frames import ToolState, tool_state
-from palpate_view.hand import Grip, Hand
+from palpate_view.hand import LONGEST_SILENCE_S, Grip, Hand
 from palpate_view.motion import Floats, Gesture
 from palpate_view.panels import DISPLACEMENT, ERROR, GRAB, Panels, legend_html, readout_html, session_html
 from palpate_view.scene import SCENE_PER_M, Scene, background, camera_position, light
@@ -27,7 +27,7 @@ from palpate_view.watch import Watch
 FRAME_PERIOD_S = 1 / 30
 CHART_PERIOD_S = 0.2
 PULSE_S = 0.1  # pause between two questions to the page that drags
-_PULSE_TIMEOUT_S = 2.0
+_PULSE_TIMEOUT_S = LONGEST_SILENCE_S
 _SMALLEST_SCALE_M = 1e-3
 _SCALE_HALF_LIFE_S = 4.0  # of the colors' largest value, after the tissue has moved less
 _PATCH_SPHERE = 0.4  # of the patch's radius: of the sphere that is drawn for its tool

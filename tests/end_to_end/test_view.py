@@ -27,7 +27,14 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is install
 PICTURES = Path(__file__).parents[2] / "out" / "screenshots"
 PATIENCE_MS = 60_000
 CLOSED_S = 0.1  # from the page's close to no force
-SWIFTSHADER = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+# Pictures are drawn in software; what is around the picture is quicker without the detour over the graphics library.
+SWIFTSHADER = (
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-gpu-compositing",
+    "--disable-gpu-rasterization",
+)
 NO_NETWORK = (
     "--disable-quic",
     "--no-first-run",
@@ -60,7 +67,7 @@ def view(start: Callable[..., Any]) -> Callable[[str], str]:
 
 def opened(browser: Any, address: str, **options: Any) -> Any:
     """The page, once it shows the organ."""
-    page = browser.new_page(**(options or {"viewport": {"width": 1280, "height": 800}}))
+    page = browser.new_page(**(options or {"viewport": {"width": 1040, "height": 600}}))
     page.set_default_timeout(PATIENCE_MS)
     page.goto(address)
     page.get_by_text("Drag on the organ").wait_for()
@@ -126,6 +133,7 @@ def test_a_drag_on_the_organ_presses_and_the_closed_page_lets_go(
     raise AssertionError(f"the force was gone {took_s} s after the page was closed, expected {CLOSED_S}")
 
 
+@pytest.mark.slow
 def test_a_patch_is_dragged_and_let_go_with_the_button_and_by_a_page_that_hangs(
     browser: Any, serve: Callable[..., Any], view: Callable[[str], str], connect: Callable[..., Any]
 ) -> None:
@@ -144,6 +152,7 @@ def test_a_patch_is_dragged_and_let_go_with_the_button_and_by_a_page_that_hangs(
         client.force_when(lambda message: newtons(message) == 0, "no force of a page that hangs")
 
 
+@pytest.mark.slow
 def test_buttons_record_and_load_another_model(
     browser: Any,
     serve: Callable[..., Any],
@@ -173,6 +182,7 @@ def test_buttons_record_and_load_another_model(
         page.close()
 
 
+@pytest.mark.slow
 def test_the_page_fits_a_phone_and_a_finger_presses(
     browser: Any,
     serve: Callable[..., Any],
