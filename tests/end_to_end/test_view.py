@@ -46,6 +46,7 @@ NO_NETWORK = (
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
+    PICTURES.mkdir(parents=True, exist_ok=True)
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*SWIFTSHADER, *NO_NETWORK])
         yield browser
@@ -70,7 +71,8 @@ def opened(browser: Any, address: str, **options: Any) -> Any:
     page = browser.new_page(**(options or {"viewport": {"width": 1040, "height": 600}}))
     page.set_default_timeout(PATIENCE_MS)
     page.goto(address)
-    page.get_by_text("Drag on the organ").wait_for()
+    page.get_by_text("Drag on the organ").wait_for(state="attached")  # on a phone the controls are closed
+    page.evaluate("document.querySelectorAll('[class*=Notification] button').forEach(b => b.click())")
     return page
 
 
@@ -110,7 +112,6 @@ def test_a_drag_on_the_organ_presses_and_the_closed_page_lets_go(
 ) -> None:
     served = serve(model=make_surface_model())
     address = view(served.endpoint)
-    PICTURES.mkdir(parents=True, exist_ok=True)
     with connect(served.endpoint) as client:
         took_s = []
         for _ in range(3):  # a busy machine may close a page late
