@@ -118,7 +118,7 @@ def drag_on_page(open_page: Callable[[], Page], endpoint: str, seconds: float) -
         page.get_by_text("Drag on the organ").wait_for(timeout=60_000)
         box = page.locator("canvas").first.bounding_box()
         assert box is not None
-        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        x, y = box["x"] + box["width"] / 2 + 55, box["y"] + box["height"] / 2 + 40  # beside the tool
         page.mouse.move(x, y)
         page.mouse.down()
         end_s, i = time.monotonic() + seconds, 0

@@ -81,15 +81,15 @@ def opened(browser: Any, address: str, **options: Any) -> Any:
     return page
 
 
-def middle(page: Any) -> tuple[float, float]:
-    """Where the organ is: the middle of the picture."""
+def beside_the_tool(page: Any) -> tuple[float, float]:
+    """A place on the organ: it is in the middle of the picture, and so is the tool."""
     box = page.locator("canvas").first.bounding_box()
-    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    return box["x"] + box["width"] / 2 + 55, box["y"] + box["height"] / 2 + 40
 
 
 def drag_until(page: Any, condition: Callable[[], object], what: str) -> None:
-    """Drag around the middle of the picture until something is so; the button stays down."""
-    x, y = middle(page)
+    """Drag around on the organ until something is so; the button stays down."""
+    x, y = beside_the_tool(page)
     page.mouse.move(x, y)
     page.mouse.down()
     end_s = time.monotonic() + PATIENCE_MS / 1e3
@@ -122,7 +122,7 @@ def test_a_drag_on_the_organ_presses_and_the_closed_page_lets_go(
         for _ in range(3):  # a busy machine may close a page late
             page = opened(browser, address)
             at_rest = page.screenshot(path=PICTURES / "surface_at_rest.png")
-            drag_until(page, lambda: newtons(client.forces[-1]) > 0.3, "a force")
+            drag_until(page, lambda: newtons(client.forces[-1]) > 0.15, "a force")
             drag_until(page, lambda page=page: newtons_shown(page) > 0.1, "the force on the page")
             assert page.screenshot(path=PICTURES / "surface_pressed.png") != at_rest
             assert client.forces[-1]["flags"][0] & Flags.IN_CONTACT
@@ -204,11 +204,11 @@ def test_the_page_fits_a_phone_and_a_finger_presses(
         page = opened(browser, view(served.endpoint), **phone)
         wide = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
         assert wide <= 0  # nothing to scroll sideways
-        x, y = middle(page)
+        x, y = beside_the_tool(page)
         touch = page.context.new_cdp_session(page)
         touch.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [{"x": x, "y": y}]})
         end_s, i = time.monotonic() + PATIENCE_MS / 1e3, 0
-        while newtons(client.forces[-1]) < 0.2:
+        while newtons(client.forces[-1]) < 0.15:
             assert time.monotonic() < end_s, "waited for a force"
             i += 1
             point = {"x": x + 20 * math.sin(i / 8), "y": y}
