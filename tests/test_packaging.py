@@ -50,9 +50,7 @@ def needs(extra: str) -> set[str]:
 def test_a_plain_installation_is_a_client() -> None:
     assert needs("") == {"eclipse-zenoh", "msgpack"}
     assert needs("server") == {"numpy", "numba"}
-    assert needs("all") >= needs("build") | needs("plots") | needs("recorder") | needs("metrics") | needs(
-        "view"
-    )
+    assert needs("all") >= needs("build") | needs("plots") | needs("recorder") | needs("metrics")
     assert {c.extra for c in COMMANDS.values()} <= {
         "",
         "server",
@@ -61,7 +59,6 @@ def test_a_plain_installation_is_a_client() -> None:
         "experiments",
         "images",
         "completion",
-        "view",
         "all",
     }
 
@@ -115,7 +112,6 @@ def test_a_client_runs_without_numpy() -> None:
         (["check-host"], "numba", "server"),
         (["record", "out.mcap"], "zenoh", ""),
         (["replay", "in.mcap", "model.npz"], "mcap", "recorder"),
-        (["view"], "viser", "view"),
         (["demo"], "scipy", "all"),
         (["reproduce"], "scipy", "experiments"),
         (["health"], "zenoh", ""),

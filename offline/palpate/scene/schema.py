@@ -62,7 +62,7 @@ class BallGeometry(Table):
 
     shape: Literal["ball"]
     radius_m: Length
-    spacing_m: Length
+    spacing_m: Length = Field(description="between nodes")
 
     @model_validator(mode="after")
     def _is_of_a_size(self) -> BallGeometry:
@@ -79,7 +79,7 @@ class SurfaceGeometry(Table):
     shape: Literal["surface"]
     file: str = Field(description="STL, OBJ, PLY, OFF, VTK or VTP, relative to the configuration")
     file_unit: LengthUnit = Field(default="m", description="unit of the file's coordinates")
-    spacing_m: Length
+    spacing_m: Length = Field(description="between nodes, where nothing refines them")
     growth: Number = Field(
         default=0.3,
         gt=0,
@@ -124,8 +124,10 @@ class SurfaceTable(Table):
         description="largest relative force error of the smallest tool in the band: it decides how many modes are kept",
     )
     modes: Count | None = Field(default=None, ge=1, description="number of modes; displaces tolerance")
-    band_hz: tuple[Number, Number] = (0.0, 30.0)
-    period_s: Number = Field(default=1e-3, ge=SHORTEST_PERIOD_S, le=LONGEST_PERIOD_S)
+    band_hz: tuple[Number, Number] = Field(default=(0.0, 30.0), description="the haptic band, Hz")
+    period_s: Number = Field(
+        default=1e-3, ge=SHORTEST_PERIOD_S, le=LONGEST_PERIOD_S, description="between two ticks, s"
+    )
 
     @model_validator(mode="after")
     def _makes_sense(self) -> SurfaceTable:
@@ -138,7 +140,7 @@ class SurfaceTable(Table):
 class MaterialTable(Table):
     """A preset by name, with any of its constants replaced; or all constants."""
 
-    preset: str | None = None
+    preset: str | None = Field(default=None, description="a tissue by name; `palpate tissues` lists them")
     youngs_modulus_pa: Number | None = Field(default=None, description="at rest (fully relaxed), Pa")
     poissons_ratio: Number | None = None
     density_kg_per_m3: Number | None = None
@@ -193,7 +195,7 @@ class DiscretizationTable(Table):
 
 
 class ReductionTable(Table):
-    """How the full model is reduced and sampled."""
+    """How the full model is reduced and sampled. One of order and tolerance; without the table, tolerance is 0.01."""
 
     method: ReductionMethod = "passive"
     order: Count | None = Field(default=None, ge=2, description="number of states")
@@ -206,8 +208,10 @@ class ReductionTable(Table):
         lt=1,
         description="largest relative in-band error of the surface; with tolerance",
     )
-    band_hz: tuple[Number, Number] = (0.0, 30.0)
-    period_s: Number = Field(default=1e-3, ge=SHORTEST_PERIOD_S, le=LONGEST_PERIOD_S)
+    band_hz: tuple[Number, Number] = Field(default=(0.0, 30.0), description="the haptic band, Hz")
+    period_s: Number = Field(
+        default=1e-3, ge=SHORTEST_PERIOD_S, le=LONGEST_PERIOD_S, description="between two ticks, s"
+    )
     sampling: Literal["bilinear", "first-order-hold"] = "bilinear"
 
     @model_validator(mode="after")
