@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = {
     "palpate_client": ROOT / "client" / "palpate_client",
+    "palpate_view": ROOT / "client" / "palpate_view",
     "palpate_server": ROOT / "server" / "palpate_server",
     "palpate": ROOT / "offline" / "palpate",
     "palpate_paper": ROOT / "offline" / "palpate_paper",
@@ -19,6 +20,7 @@ PACKAGES = {
 
 ALLOWED = {
     "palpate_client": ("palpate.files",),
+    "palpate_view": ("palpate_client",),
     "palpate_server": (
         "palpate_client.wire",
         "palpate_client.messages",
@@ -202,6 +204,8 @@ def test_the_rooms_of_a_package_import_one_way(package: str, all_imports: list[I
     [
         ("palpate_client.tool", "import palpate_server.codec", False),
         ("palpate_client.tool", "from palpate import model_file", False),
+        ("palpate_view.session", "from palpate_server.session import leases", False),
+        ("palpate_view.session", "from palpate_client import Connection", True),
         ("palpate_server.session.server", "from palpate_client.wire import KEYS", True),
         ("palpate_server.session.server", "from palpate_client import Connection", False),
         ("palpate_server.session.server", "from palpate.reduction import reduce", False),

@@ -50,7 +50,9 @@ def needs(extra: str) -> set[str]:
 def test_a_plain_installation_is_a_client() -> None:
     assert needs("") == {"eclipse-zenoh", "msgpack"}
     assert needs("server") == {"numpy", "numba"}
-    assert needs("all") >= needs("build") | needs("plots") | needs("recorder") | needs("metrics")
+    assert needs("all") >= needs("build") | needs("plots") | needs("recorder") | needs("metrics") | needs(
+        "view"
+    )
     assert {c.extra for c in COMMANDS.values()} <= {
         "",
         "server",
@@ -59,6 +61,7 @@ def test_a_plain_installation_is_a_client() -> None:
         "experiments",
         "images",
         "completion",
+        "view",
         "all",
     }
 
@@ -112,6 +115,7 @@ def test_a_client_runs_without_numpy() -> None:
         (["check-host"], "numba", "server"),
         (["record", "out.mcap"], "zenoh", ""),
         (["replay", "in.mcap", "model.npz"], "mcap", "recorder"),
+        (["view"], "viser", "view"),
         (["demo"], "scipy", "all"),
         (["reproduce"], "scipy", "experiments"),
         (["health"], "zenoh", ""),

@@ -200,10 +200,12 @@ class Geometry:
 
     vertices_m: 3 n_vertices float32, m, in the model's frame; x, y, z of vertex 0 first.
     triangles: 3 n_triangles int32, indices of vertices; counter-clockwise seen from outside.
+    error_in_band: n_vertices float32, how good the model is at each vertex; None when the server doesn't know.
     """
 
     vertices_m: array[float]
     triangles: array[int]
+    error_in_band: array[float] | None = None
 
 
 @dataclass(frozen=True)
@@ -220,7 +222,10 @@ def decode_geometry(payload: bytes) -> Geometry:
     message = wire.unpack(payload, wire.Kind.GEOMETRY)
     vertices = _numbers(message, "vertices_m", "f", "n_vertices")
     triangles = _numbers(message, "triangles", "i", "n_triangles")
-    return Geometry(vertices, triangles)
+    error = None
+    if message.get("error_in_band") is not None:
+        error = _numbers(message, "error_in_band", "f", "n_vertices", width=1)
+    return Geometry(vertices, triangles, error)
 
 
 def decode_surface(payload: bytes) -> Surface:
@@ -238,18 +243,17 @@ def read_surface(message: Mapping[str, Any]) -> Surface:
 
 
 def _numbers(
-    message: Mapping[str, Any], field: str, typecode: str, rows_field: str | None = None
+    message: Mapping[str, Any], field: str, typecode: str, rows_field: str | None = None, width: int = 3
 ) -> array[Any]:
-    """The little-endian numbers of a field, three a row; rows_field says how many rows there are."""
+    """The little-endian numbers of a field, `width` a row; rows_field says how many rows there are."""
     value = message.get(field)
-    if not isinstance(value, bytes) or len(value) % 12:
-        raise wire.MalformedMessage(
-            "wrong_type", f"{field}: expected bytes, rows of three numbers of 4 bytes"
-        )
-    if rows_field is not None and message.get(rows_field) != len(value) // 12:
+    row_bytes = 4 * width
+    if not isinstance(value, bytes) or len(value) % row_bytes:
+        raise wire.MalformedMessage("wrong_type", f"{field}: expected bytes, rows of {row_bytes} bytes")
+    if rows_field is not None and message.get(rows_field) != len(value) // row_bytes:
         raise wire.MalformedMessage(
             "wrong_shape",
-            f"{field} has {len(value) // 12} rows: expected {rows_field}, {message.get(rows_field)}",
+            f"{field} has {len(value) // row_bytes} rows: expected {rows_field}, {message.get(rows_field)}",
         )
     numbers = array(typecode, value)
     if sys.byteorder == "big":

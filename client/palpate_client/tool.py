@@ -29,6 +29,7 @@ class Tool:
     name: the tool's name; without it, the model's first.
     frame: how the client's axes and unit relate to the model's.
     silence_s: `move` gives up when no force has come for this long.
+    radius_m, friction: of the sphere, for a surface model; without them, the model file's. See "Tips" in docs/wire.md.
 
     Attributes
     ----------
@@ -47,6 +48,8 @@ class Tool:
         *,
         frame: Frame | None = None,
         silence_s: float = 1.0,
+        radius_m: float | None = None,
+        friction: float | None = None,
     ) -> None:
         tools = connection.description.tools
         self.name = tools[0].name if name is None else name
@@ -61,6 +64,7 @@ class Tool:
         self.newest: Force | None = None  # the newest force that keeps the contract
         self._connection = connection
         self._silence_s = silence_s
+        self._tip = {"radius_m": radius_m, "friction": friction}
         self._since_s = time.monotonic()
         self._rendered_tick: int | None = None
         self._attached = False
@@ -171,7 +175,9 @@ class Tool:
         return round_trip_s
 
     def _acquire(self, **device: Any) -> None:
-        answer = self._connection.control("acquire", tools=[self.name], frame=self.frame.message(), **device)
+        answer = self._connection.control(
+            "acquire", tools=[self.name], frame=self.frame.message(), **self._tip, **device
+        )
         agreed = answer["tools"][self.name]
         self.limits = agreed["limits"]
         x, y, z = agreed["home_m"]

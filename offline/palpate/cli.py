@@ -38,6 +38,7 @@ COMMANDS = {
     "check-host": Command(_SERVE, "measure whether this machine holds 1 kHz, and what to change", "server", "palpate_server.diagnostics.check_host"),
     "health": Command(_SERVE, "say whether a server is there and its loop runs", "", "palpate_client.health"),
     "client": Command(_TOUCH, "poke a running server and check every answer", "", "palpate_client.poke"),
+    "view": Command(_TOUCH, "see a running server in the browser, and touch it with the mouse", "view", "palpate_view.program"),
     "record": Command(_WATCH, "have a running server record its session to an MCAP file", "", "palpate_server.recording.record"),
     "replay": Command(_WATCH, "repeat a recording offline and compare bit for bit", "recorder", "palpate_server.recording.replay"),
     "completion": Command("This command line", "print what a shell needs to complete commands and options", "completion", "palpate.completion"),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import msgpack
 import numpy as np
@@ -200,15 +200,23 @@ def encode_surface(tick: int, server_time_ns: int, displacement: NDArray[np.floa
     )
 
 
-def encode_geometry(vertices: NDArray[np.float64], triangles: NDArray[np.int32]) -> bytes:
-    """The surface at rest: vertices (n_vertices, 3), m, as little-endian float32; triangles (n, 3) as int32."""
-    return pack(
-        {
-            "kind": Kind.GEOMETRY,
-            "schema_version": SCHEMA_VERSION,
-            "n_vertices": len(vertices),
-            "n_triangles": len(triangles),
-            "vertices_m": vertices.astype("<f4").tobytes(),
-            "triangles": triangles.astype("<i4").tobytes(),
-        }
-    )
+def encode_geometry(
+    vertices: NDArray[np.float64],
+    triangles: NDArray[np.int32],
+    error_in_band: NDArray[np.float32] | None = None,
+) -> bytes:
+    """The surface at rest: vertices (n_vertices, 3), m, as little-endian float32; triangles (n, 3) as int32.
+
+    error_in_band (n_vertices,), a fraction, is left out when it is not known.
+    """
+    message: dict[str, Any] = {
+        "kind": Kind.GEOMETRY,
+        "schema_version": SCHEMA_VERSION,
+        "n_vertices": len(vertices),
+        "n_triangles": len(triangles),
+        "vertices_m": vertices.astype("<f4").tobytes(),
+        "triangles": triangles.astype("<i4").tobytes(),
+    }
+    if error_in_band is not None:
+        message["error_in_band"] = error_in_band.astype("<f4").tobytes()
+    return pack(message)

@@ -35,6 +35,11 @@ def test_geometry_and_surface_are_buffers_that_numpy_wraps_without_a_copy() -> N
     np.testing.assert_array_equal(vertices, np.arange(6).reshape(2, 3))
     assert np.shares_memory(vertices, np.frombuffer(geometry.vertices_m, "f4"))
     assert geometry.triangles.tolist() == [0, 1, 0]
+    assert geometry.error_in_band is None
+    known = decode_geometry(
+        msgpack.packb(GEOMETRY | {"error_in_band": np.array([0.25, 0.5], "<f4").tobytes()})
+    )
+    assert known.error_in_band is not None and known.error_in_band.tolist() == [0.25, 0.5]
     assert (surface.tick, surface.server_time_ns) == (7, 8)
     assert surface.displacement_m.tolist() == list(range(6))
 
@@ -47,6 +52,8 @@ def test_geometry_and_surface_are_buffers_that_numpy_wraps_without_a_copy() -> N
         ({"n_triangles": None}, "wrong_shape"),
         ({"vertices_m": bytes(7)}, "wrong_type"),
         ({"triangles": [0, 1, 2]}, "wrong_type"),
+        ({"error_in_band": bytes(4)}, "wrong_shape"),
+        ({"error_in_band": 0.1}, "wrong_type"),
     ],
 )
 def test_geometry_that_is_not_as_described_is_refused(change: dict[str, object], reason: str) -> None:

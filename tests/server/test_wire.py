@@ -399,7 +399,9 @@ def test_the_page_lists_exactly_the_fields_of_a_description(state: SessionState)
 
 
 def test_the_page_lists_exactly_the_fields_of_geometry_and_surface() -> None:
-    geometry = msgpack.unpackb(codec.encode_geometry(np.zeros((1, 3)), np.zeros((1, 3), np.int32)))
+    surface = (np.zeros((1, 3)), np.zeros((1, 3), np.int32))
+    geometry = msgpack.unpackb(codec.encode_geometry(*surface, np.zeros(1, np.float32)))
+    assert geometry.keys() - msgpack.unpackb(codec.encode_geometry(*surface)).keys() == {"error_in_band"}
     assert _fields("Geometry") == list(geometry)
     assert _fields("Surface") == list(msgpack.unpackb(codec.encode_surface(0, 0, np.zeros(3, np.float32))))
 

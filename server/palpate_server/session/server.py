@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import zenoh
 
+from palpate.model_file import SurfaceModel
 from palpate_client.wire import Keys, pack
 from palpate_server import codec
 from palpate_server.coupling import models
@@ -89,7 +91,7 @@ class Server:
             keys,
             self._requests,
             describe=lambda: pack(description(state)),
-            geometry=lambda: codec.encode_geometry(*models.surface_at_rest(state.model)),
+            geometry=lambda: _geometry(state.model),
             on_change=self._status.publish,  # so that a status shows every setting
         )
         self._command_thread_prepared = False
@@ -189,3 +191,11 @@ def serve(
             server.publish_status()
     finally:
         server.stop()
+
+
+def _geometry(model: Model) -> bytes:
+    """The answer to a query for the geometry, with the error map of a surface model that has evidence."""
+    error = model.accuracy.error_map if isinstance(model, SurfaceModel) else None
+    if error is not None and not np.isfinite(error).all():
+        error = None
+    return codec.encode_geometry(*models.surface_at_rest(model), error)

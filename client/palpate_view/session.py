@@ -1,0 +1,360 @@
+"""One connection to a server on the page: what the pointer does, and what is drawn, until the server or its model changes."""
+
+from __future__ import annotations
+
+import html
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from palpate_client import ClientError, Connection, Geometry, Tool
+from palpate_client.wire import RECORDER, Flags
+from palpate_view import motion
+from palpate_view.colors import nice_ceiling
+from palpate_view.frames import ToolState, tool_state
+from palpate_view.hand import LONGEST_SILENCE_S, Grip, Hand
+from palpate_view.motion import Floats, Gesture
+from palpate_view.panels import DISPLACEMENT, ERROR, GRAB, Panels, legend_html, readout_html, session_html
+from palpate_view.scene import SCENE_PER_M, Scene, background, camera_position, light
+from palpate_view.surface import Hit, Triangles, ray_hit, touched_points
+from palpate_view.watch import Watch
+
+FRAME_PERIOD_S = 1 / 30
+CHART_PERIOD_S = 0.2
+PULSE_S = 0.1  # pause between two questions to the page that drags
+_PULSE_TIMEOUT_S = LONGEST_SILENCE_S
+_SMALLEST_SCALE_M = 1e-3
+_SCALE_HALF_LIFE_S = 4.0  # of the colors' largest value, after the tissue has moved less
+_PATCH_SPHERE = 0.4  # of the patch's radius: of the sphere that is drawn for its tool
+
+
+class Session:
+    """Shows the model that a connection's server runs; `run` returns when another model runs there.
+
+    connect(name) makes a connection of another client name to the same server. tell(text) tells the user something.
+    """
+
+    def __init__(
+        self,
+        page: viser.ViserServer,
+        panels: Panels,
+        connection: Connection,
+        connect: Callable[[str], Connection],
+        tell: Callable[[str], None],
+    ) -> None:
+        description = connection.description
+        self._page, self._panels, self._connection = page, panels, connection
+        self._connect, self._tell = connect, tell
+        self._tools = {tool.name: tool for tool in description.tools}
+        self._model = description.message["model"]
+        self._anywhere = self._model.get("kind") == "surface"
+        self._watch = Watch(connection, description.tools[0].name)
+        self._hand = Hand(connection, tell)
+        self._axis = np.asarray(description.tools[0].normal, float)  # of the tool's shaft
+        self._largest_m = _SMALLEST_SCALE_M
+        page.scene.reset()
+        light(page.scene, self._normal())
+        page.scene.set_background_image(background(), "png")
+        geometry = connection.geometry()
+        self._scene = Scene(page.scene, *surface_at_rest(geometry))
+        error = geometry.error_in_band
+        self._error = None if error is None else np.frombuffer(error, np.float32)
+        self._scene.on_drag(self._on_organ, self._on_tool)
+        described = description.message["tools"]
+        panels.fill(
+            {tool["name"]: tool["radius_m"] for tool in described},
+            described[0]["friction"] if self._anywhere else None,
+            has_error=self._error is not None,
+        )
+        for client in page.get_clients().values():
+            self.frame_organ(client)
+
+    def run(self, stop: threading.Event) -> None:
+        """Draw until another model runs or `stop` is set. Raises ServerGone."""
+        charts_s = 0.0
+        try:
+            while not stop.wait(FRAME_PERIOD_S):
+                self._connection.check()
+                status = self._connection.status
+                if status and status["model"]["config_sha256"] != self._model["config_sha256"]:
+                    return
+                if not self._page.get_clients():
+                    self._watch.end()
+                    continue
+                self._watch.begin()
+                with self._page.atomic():
+                    state = self._draw()
+                    if state is not None and time.monotonic() - charts_s > CHART_PERIOD_S:
+                        charts_s = time.monotonic()
+                        self._draw_panels(state)
+        finally:
+            self._hand.end()
+            self._watch.end()
+
+    # Pages
+
+    def frame_organ(self, client: viser.ClientHandle) -> None:
+        """Put the camera of a page where the organ fills its picture."""
+        scene, camera = self._scene, client.camera
+        position = camera_position(scene.center_m, scene.size_m, self._normal(), camera.aspect, camera.fov)
+        camera.up_direction = (0.0, 0.0, 1.0)
+        camera.position = SCENE_PER_M * position
+        camera.look_at = SCENE_PER_M * (scene.center_m + 0.06 * scene.size_m * self._normal())
+
+    def page_closed(self, page: int) -> None:
+        self._hand.let_go(page)
+
+    # What is drawn
+
+    def _draw(self) -> ToolState | None:
+        """One picture; None before the first messages have come."""
+        force, tool, surface = self._watch.force, self._watch.tool_status, self._watch.surface
+        if force is None or tool is None or surface is None or len(surface) != len(self._scene.vertices):
+            return None
+        state = tool_state(force, tool)
+        length = np.linalg.norm(surface, axis=1)
+        fading = 0.5 ** (FRAME_PERIOD_S / _SCALE_HALF_LIFE_S)
+        self._largest_m = max(float(length.max()), self._largest_m * fading, _SMALLEST_SCALE_M)
+        values, largest = self._colors(length)
+        self._scene.draw_organ(surface, values, largest)
+        self._turn_axis()
+        radius_m = self._radius_m(tool)
+        if self._anywhere:
+            center, points = state.tip_m, np.zeros((0, 3))
+            if force.flags & Flags.IN_CONTACT:
+                points = touched_points(self._scene.vertices + surface, state.tip_m, radius_m)
+        else:
+            center = state.tip_m + radius_m * self._axis
+            points = self._patch_points(surface) if force.flags & Flags.IN_CONTACT else np.zeros((0, 3))
+        ghost = self._hand.position_m
+        if ghost is None:
+            ghost = state.device_m
+        self._scene.draw_tool(center, ghost + (center - state.tip_m), radius_m, self._axis)
+        self._scene.draw_contact(points, center, state.force_n)
+        return state
+
+    def _draw_panels(self, state: ToolState) -> None:
+        columns = self._watch.history.columns()
+        force, status = self._watch.force, self._connection.status
+        assert force is not None and status is not None
+        self._panels.draw_charts(columns)
+        words, good = self._words(force.flags)
+        newtons = float(np.linalg.norm(state.force_n))
+        self._panels.readout.content = readout_html(newtons, force.touch.penetration_m, words, good)
+        self._panels.legend.content = self._legend()
+        self._panels.session.content = session_html(self._facts(status))
+        recording = status["recording"] is not None
+        self._panels.show_recording(recording)
+
+    def _colors(self, length: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, float]:
+        """What the colors show, (n,), and its largest value; `length` (n,) is that of the displacement, m."""
+        shown = self._panels.color.value
+        if shown == DISPLACEMENT:
+            return length, nice_ceiling(self._largest_m)
+        if shown == ERROR and self._error is not None:
+            return self._error, self._largest_error()
+        return None, 1.0
+
+    def _legend(self) -> str:
+        shown = self._panels.color.value
+        if shown == DISPLACEMENT:
+            return legend_html(f"{1e3 * nice_ceiling(self._largest_m):g} mm")
+        if shown == ERROR and self._error is not None:
+            return legend_html(f"{100 * self._largest_error():g} % and more")
+        return ""
+
+    def _largest_error(self) -> float:
+        """Nearly the largest of the map: supports, where it is largest by far, leave no colors for the rest."""
+        assert self._error is not None
+        return nice_ceiling(max(float(np.quantile(self._error, 0.95)), 1e-4))
+
+    def _words(self, flags: int) -> tuple[str, bool]:
+        """What the tool does, in a few words, and whether all is well."""
+        holder = (self._watch.tool_status or {}).get("holder")
+        if holder is None:
+            return "Drag on the organ, or drag the tool", True
+        if flags & (
+            Flags.FAULT | Flags.JUMPED | Flags.FORCE_CLAMPED | Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED
+        ):
+            return _LIMITED[next(flag for flag in _LIMITED if flags & flag)], False
+        if flags & (Flags.DECAYING | Flags.STALE):
+            return "no commands: the force has faded", False
+        doing = (
+            "holds the tissue" if flags & Flags.ATTACHED else "slides" if flags & Flags.SLIDING else "touches"
+        )
+        doing = doing if flags & Flags.IN_CONTACT else "does not touch"
+        mine = holder == self._connection.name
+        return f"{doing}" if mine else f"{html.escape(holder)} holds the tool: it {doing}", True
+
+    def _facts(self, status: dict[str, Any]) -> list[tuple[str, str]]:
+        def times(name: str) -> str:
+            values = status[name]
+            if not values or values["p50"] is None:
+                return "-"
+            return f"{1e3 * values['p50']:.2f}, {1e3 * values['p99']:.2f} ms"
+
+        return [
+            ("model", html.escape(str(self._model["name"]))),
+            ("kind, order", f"{self._model.get('kind', 'patch')}, {self._model['order']}"),
+            ("tick lateness, p50, p99", times("tick_lateness_s")),
+            ("compute time, p50, p99", times("compute_time_s")),
+            ("faults, skipped ticks", f"{status['faults']}, {status['skipped_ticks']}"),
+        ]
+
+    def _patch_points(self, surface: NDArray[np.float32]) -> Floats:
+        """(k, 3), m: the points of a patch model's tool where they are now."""
+        tool = self._tools[self._watch.tool]
+        near = np.linalg.norm(self._scene.vertices - np.asarray(tool.start_m), axis=1) <= tool.radius_m
+        return self._scene.vertices[near] + surface[near]
+
+    def _turn_axis(self) -> None:
+        """Turn the shaft a little towards the normal of the tissue that is touched; back when nothing is held."""
+        wanted = self._hand.normal
+        axis = self._axis + 0.15 * ((self._normal() if wanted is None else wanted) - self._axis)
+        self._axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
+
+    def _normal(self) -> Floats:
+        return np.asarray(self._tools[self._watch.tool].normal, float)
+
+    def _radius_m(self, tool: dict[str, Any] | None) -> float:
+        """Of the sphere that is drawn."""
+        agreed = None if tool is None else tool["radius_m"]
+        return float(agreed) if agreed is not None else _PATCH_SPHERE * self._tools[self._watch.tool].radius_m
+
+    # What the pointer does. The callbacks are async so that viser calls them in order.
+
+    async def _on_organ(self, event: Any) -> None:
+        page = event.client_id
+        if event.phase == "end":
+            self._hand.let_go(page)
+        elif event.phase == "start":
+            gesture = self._begin_on_organ(event)
+            if gesture is not None:
+                self._take(event.client, gesture)
+        elif self._anywhere:
+            pointer, hit = _pointer_m(event), self._hit(event)
+            radius_m, depth_m = self._panels.radius_m(), self._depth_m()
+            self._hand.aim(
+                page,
+                lambda g: motion.slid(g, hit, radius_m, depth_m) if g.presses else motion.moved(g, pointer),
+            )
+        else:
+            self._move(event)
+
+    async def _on_tool(self, event: Any) -> None:
+        if event.phase == "end":
+            self._hand.let_go(event.client_id)
+        elif event.phase == "start":
+            self._take(
+                event.client, motion.drag_tool(_pointer_m(event), self._normal(), glued=not self._anywhere)
+            )
+        else:
+            self._move(event)
+
+    def _begin_on_organ(self, event: Any) -> Gesture | None:
+        pointer, grabs = _pointer_m(event), self._panels.pointer.value == GRAB
+        if not self._anywhere:
+            depth_m = 0.0 if grabs else self._depth_m()
+            return motion.press_patch(self._home_m(), pointer, self._normal(), depth_m)
+        hit = self._hit(event)
+        if hit is None:
+            return None
+        radius_m = self._panels.radius_m()
+        if grabs:
+            return motion.grab_surface(hit, pointer, radius_m)
+        return motion.press_surface(hit, pointer, radius_m, self._depth_m())
+
+    def _move(self, event: Any) -> None:
+        pointer = _pointer_m(event)
+        self._hand.aim(event.client_id, lambda gesture: motion.moved(gesture, pointer))
+
+    def _take(self, client: viser.ClientHandle, gesture: Gesture) -> None:
+        tip = (
+            {"radius_m": self._panels.radius_m(), "friction": self._panels.friction.value}
+            if self._anywhere
+            else {}
+        )
+        grip = Grip(client.client_id, self._watch.tool, **tip)
+        if not self._hand.take(grip, gesture):
+            self._tell("Another page holds the tool.")
+            return
+        threading.Thread(target=self._feel_pulse, args=(client, grip), name="pulse", daemon=True).start()
+
+    def _feel_pulse(self, client: viser.ClientHandle, grip: Grip) -> None:
+        """Ask the page that drags for a sign of life, again and again: a page that hangs or sleeps does not answer."""
+        while self._hand.grip is grip:
+            try:
+                client.local_storage.get_item("palpate", timeout=_PULSE_TIMEOUT_S)
+            except TimeoutError:
+                continue
+            except (
+                RuntimeError
+            ):  # the page is gone, which viser tells apart; or it may not store, and has answered
+                pass
+            self._hand.sign(grip.page)
+            time.sleep(PULSE_S)
+
+    def _hit(self, event: Any) -> Hit | None:
+        """Where the pointer is on the undeformed surface."""
+        eye = np.asarray(event.client.camera.position, float) / SCENE_PER_M
+        scene = self._scene
+        return ray_hit(eye, _pointer_m(event) - eye, scene.vertices, scene.normals, scene.triangles)
+
+    def _home_m(self) -> Floats:
+        return np.asarray(self._tools[self._watch.tool].start_m, float)
+
+    def _depth_m(self) -> float:
+        return 1e-3 * float(self._panels.depth.value)
+
+    # What the buttons do, on threads of viser's
+
+    def choose_tool(self, name: str) -> None:
+        if name in self._tools and name != self._watch.tool:
+            self._watch.watch_tool(name)
+
+    def load(self, file: str) -> None:
+        """Have the server run another model of its folder; `run` sees it."""
+        try:
+            with Tool(self._connection, self._watch.tool):
+                answer = self._connection.control("load", file=file)
+            self._tell(f"The server runs {answer['model']['name']}.")
+        except (ClientError, RuntimeError) as error:
+            self._tell(str(error))
+
+    def record(self) -> None:
+        """Begin a recording, or end the one that runs, as `palpate record` does and under its name."""
+        status = self._connection.status
+        running = status is not None and status["recording"] is not None
+        file = None if running else time.strftime("view-%Y%m%d-%H%M%S.mcap")
+        try:
+            with self._connect(RECORDER) as recorder:
+                report = recorder.control("record", file=file)["recording"]
+            text = f"{report['messages']} messages in {report['file']}" if running else f"Recording to {file}"
+            self._tell(text)
+        except ClientError as error:
+            self._tell(str(error))
+
+
+_LIMITED = {
+    Flags.FAULT: "the model failed and was put to rest",
+    Flags.FORCE_CLAMPED: "the force is at its limit",
+    Flags.WORKSPACE_CLAMPED: "at the edge of the workspace",
+    Flags.JUMPED: "on its way",
+    Flags.SPEED_LIMITED: "at the largest speed",
+}
+
+
+def surface_at_rest(geometry: Geometry) -> tuple[Floats, Triangles]:
+    """Vertices (n, 3), m, and triangles (m, 3) of a geometry."""
+    vertices = np.frombuffer(geometry.vertices_m, np.float32).reshape(-1, 3).astype(float)
+    return vertices, np.frombuffer(geometry.triangles, np.int32).reshape(-1, 3)
+
+
+def _pointer_m(event: Any) -> Floats:
+    """(3,), m: where a drag's pointer is, in the plane through what it took, parallel to the screen."""
+    return np.asarray(event.end_position, float) / SCENE_PER_M
