@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -35,17 +37,22 @@ def run(folder: Path, *blocks: str) -> str:
     text = "\n".join(blocks)
     text = text.replace("palpate serve ", f"palpate serve --listen {endpoint} ")
     text = re.sub(r"palpate (health|client)", rf"palpate \1 --connect {endpoint}", text)
-    ended = subprocess.run(
+    shell = subprocess.Popen(
         ["bash", "-c", f"set -e; trap 'kill $(jobs -p) 2>/dev/null || true; wait' EXIT\n{text}"],
         cwd=folder,
         env=os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-        timeout=PATIENCE_S,
-        check=False,
+        start_new_session=True,
     )
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    return ended.stdout
+    try:
+        out, err = shell.communicate(timeout=PATIENCE_S)
+    finally:
+        with suppress(ProcessLookupError):  # nothing is left of the shell and what it started
+            os.killpg(shell.pid, signal.SIGKILL)
+    assert shell.returncode == 0, out + err
+    return out
 
 
 def test_the_program_on_the_page_is_the_one_in_the_examples() -> None:
