@@ -315,6 +315,7 @@ def demo() -> None:
     parser.add_argument(
         "--seconds", type=float, default=5.0, help="how long to touch, 1 to 600 s (%(default)g)"
     )
+    parser.add_argument("--view", action="store_true", help="then open it in the browser, until Ctrl-C")
     add_cache_options(parser)
     parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")
     options = parser.parse_args()
@@ -323,12 +324,17 @@ def demo() -> None:
     with stage_reporter() as stages:
         stages("libraries")
         with interrupts.ends_at_once():
-            from palpate.demo import run_demo
+            from palpate.demo import run_demo, show
             from palpate.report import accuracy_text
+
+            if options.view:
+                importlib.import_module("viser")  # better to miss it now than after the build
 
         scene = options.scene or Path(str(files("palpate_configs") / "liver-demo.toml"))
         summary = run_demo(scene, options.out, options.seconds, stages, chosen_cache(options))
-    print(accuracy_text(summary.model, options.verbose), *summary.lines(), sep="\n")
+    print(accuracy_text(summary.model, options.verbose), *summary.lines(), sep="\n", flush=True)
+    if options.view:
+        show(summary.model_path)
 
 
 def reproduce() -> None:

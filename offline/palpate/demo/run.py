@@ -85,6 +85,16 @@ def run_demo(
     return Demo(model, touch, model_path, picture)
 
 
+def show(model_path: Path) -> None:
+    """Serve a model and open its page in the browser, until Ctrl-C or a signal ends the page. Raises ServerGone."""
+    endpoint = free_endpoint()
+    serve = [sys.executable, "-m", "palpate_server", str(model_path), "--listen", endpoint]
+    view = [sys.executable, "-m", "palpate", "view", "--connect", endpoint, "--open"]
+    with running(serve, "serving"), running(view, "palpate view:") as (page, where):
+        print(where, flush=True)
+        page.wait()
+
+
 def _reference(
     config: Config, folder: Path, cache: StageCache, model: SurfaceModel, points: NDArray[np.intp]
 ) -> SurfaceModel:
