@@ -1,9 +1,9 @@
 """Tip stiffness of the shipped liver: palpate beside quadratic tetrahedra of scikit-fem on the same surface.
 
-    python benchmarks/finite_elements_organ.py [--edges-mm 40 24 16 12 8] [--spacings-mm 16 12 8 6.2] [--superlu]
+    python benchmarks/finite_elements_organ.py [--edges-mm 40 24 16 12 8] [--spacings-mm 16 12 8 6.2] [--without-mkl]
 
 The surface, the held region, the material at rest and the bonded tip (5 mm radius, no rotation) are those of
-`configs/liver.toml`. fTetWild (package pytetwild, with pyvista) fills the surface with tetrahedra of the given edge; those
+`configs/liver-coarse.toml`. fTetWild (package pytetwild, with pyvista) fills the surface with tetrahedra of the given edge; those
 near the rims of the tip and of the held region are bisected until their longest edge is at most a share of their distance
 from the rim, and nodes next to the rims are moved onto them. palpate's spacing on the patch is 0.15 of that of the cloud, as
 in the scene. The reference is the finest finite element mesh.
@@ -54,8 +54,8 @@ SLOPE = 1.2
 
 
 def scene(spacing_mm: float) -> Config:
-    """The shipped scene with the spacings of cloud and patch changed together."""
-    table = tomllib.loads((CONFIGS / "liver.toml").read_text(encoding="utf-8"))
+    """The scene with the spacings of cloud and patch changed together."""
+    table = tomllib.loads((CONFIGS / "liver-coarse.toml").read_text(encoding="utf-8"))
     table["geometry"]["spacing_m"] = spacing_mm / 1000
     table["contact"][0]["spacing_m"] = PATCH_SPACING * spacing_mm / 1000
     return Config.model_validate(table)
@@ -262,11 +262,10 @@ def volumes(mesh: Any) -> Array:
 # The run
 
 
-def row(kind: str, size_mm: float, superlu: bool) -> dict[str, Any] | None:
+def row(kind: str, size_mm: float, without_mkl: bool) -> dict[str, Any] | None:
     """What a process of its own found; None where it fails."""
-    command = [sys.executable, str(Path(__file__).resolve()), "--one", kind, str(size_mm)] + [
-        "--superlu"
-    ] * superlu
+    command = [sys.executable, str(Path(__file__).resolve()), "--one", kind, str(size_mm)]
+    command += ["--without-mkl"] * without_mkl
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         print(f"{kind} {size_mm:g} mm failed: {(done.stderr.strip().splitlines() or ['?'])[-1][:100]}")
@@ -281,10 +280,10 @@ def main() -> None:
     )
     parser.add_argument("--edges-mm", type=float, nargs="+", default=[40.0, 24.0, 16.0, 12.0, 8.0])
     parser.add_argument("--spacings-mm", type=float, nargs="+", default=[16.0, 12.0, 8.0, 6.2])
-    parser.add_argument("--superlu", action="store_true", help="without MKL PARDISO")
+    parser.add_argument("--without-mkl", action="store_true", help="as if MKL PARDISO were not installed")
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.superlu:
+    if options.without_mkl:
         pardiso.library = lambda: None  # type: ignore[assignment]
     if options.one:
         kind, size = options.one
@@ -305,7 +304,7 @@ def main() -> None:
     )
     reference: Array | None = None
     for kind, size in bodies:
-        found = row(kind, size, options.superlu)
+        found = row(kind, size, options.without_mkl)
         if found is None:
             continue
         reference = np.array(found["stiffness"]) if reference is None else reference

@@ -1,6 +1,6 @@
-"""The shipped liver from surface to model at several node spacings: seconds and peak memory of every stage.
+"""The liver from surface to model at several node spacings: seconds and peak memory of every stage.
 
-    python benchmarks/organ_scale.py [--spacings-mm 12 8 6.2 4.9 3.8] [--without-mkl]
+    python benchmarks/organ_scale.py [--spacings-mm 12 8 6.2 4.9] [--without-mkl]
 
 Each spacing runs in a process of its own, whose peak memory is read after every stage, so it never falls from stage to
 stage. Processor seconds stand beside wall seconds: on a shared machine they are the ones to compare. The last table has

@@ -3,7 +3,7 @@
     python benchmarks/reductions.py [--spacing-mm 12] [--orders 120 240 540] [--contenders NAME ...] [--timeout 60]
     python benchmarks/reductions.py --spacing-mm 6.2 --direct
 
-The body is `configs/liver.toml` at the given node spacing. Up to 2,000 nodes all its modes are known and errors are those
+The body is the liver of `configs/liver.toml` at the given node spacing. Up to 2,000 nodes all its modes are known and errors are those
 against them; above, they are against its Ritz modes, and with --direct the force is also compared with solves of
 h(s) K + s² M at 5, 15 and 29 Hz: a complex symmetric factorization (MKL PARDISO, else SuperLU) of the matrices in the
 parameters, which shares nothing with the modes but K and M.
@@ -87,7 +87,7 @@ JUDGED_VERTICES = 200
 # The body
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     """What the contenders get: modes without shapes, the material's memory, and shapes on the surface to judge with."""
 
@@ -268,16 +268,12 @@ def _passive(body: Body, order: int) -> PoleResidueSystem:
 
 
 @functools.cache
-def _family(body_id: int, method: str) -> Any:
-    return reductions(_BODIES[body_id].full, method, SAMPLING.band_hz)  # type: ignore[arg-type]
-
-
-_BODIES: dict[int, Body] = {}
+def _family(body: Body, method: str) -> Any:
+    return reductions(body.full, method, SAMPLING.band_hz)  # type: ignore[arg-type]
 
 
 def _of_family(method: str, body: Body, order: int) -> PoleResidueSystem:
-    _BODIES[id(body)] = body
-    family = _family(id(body), method)
+    family = _family(body, method)
     possible = family.orders[family.orders <= order]
     if not len(possible):
         raise ReductionError(f"needs at least {family.orders[0]} states")

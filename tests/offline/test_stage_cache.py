@@ -24,6 +24,8 @@ from palpate.scene.schema import check_config
 from palpate.stage_cache import NO_CACHE, StageCache, key_of
 from palpate.stage_keys import stage_keys
 
+CONFIGS = Path(__file__).parents[2] / "configs"
+
 
 @dataclass(frozen=True)
 class Thing:
@@ -126,6 +128,14 @@ def test_keys_follow_what_a_stage_depends_on(slab_scene):
     )
     finer = stage_keys(slab(slab_scene, geometry__counts=[8, 7, 4]), here)
     assert finer.cloud != keys.cloud
+
+
+def test_the_nodes_of_a_surface_follow_its_fixed_regions():
+    """They lie in pairs along the edges of these; a cloud made for another region would be a wrong one."""
+    scene = tomllib.loads((CONFIGS / "liver-coarse.toml").read_text(encoding="utf-8"))
+    keys = stage_keys(check_config(scene, "liver"), CONFIGS)
+    scene["fixed"][0]["point_m"] = [0.0, 0.05, 0.0]
+    assert stage_keys(check_config(scene, "liver"), CONFIGS).cloud != keys.cloud
 
 
 KILLED = """

@@ -1,9 +1,9 @@
 """Cholesky's factorization of a sparse matrix whose unknowns have places in space, by LAPACK on dense fronts.
 
-Nested dissection (George 1973): a plane parts the nodes in two halves, and those on one side that are coupled to the other
-come after both; each half is parted again. A front is the dense matrix of the unknowns that are eliminated together and of
-the later ones that they are coupled to. What elimination leaves on the latter is added to the front above (the multifrontal
-method: Duff & Reid 1983, Liu 1992). So nearly all arithmetic is done by the matrix products of LAPACK and BLAS.
+Nested dissection (George 1973): a plane divides the nodes into two halves. The nodes of one half that are coupled to the other
+are eliminated after both; each half is divided again. A front is the dense matrix of the unknowns that are eliminated together and of
+the later ones that they are coupled to. Their elimination changes the matrix of the later ones; this update is added to the
+parent's front (the multifrontal method: Duff & Reid 1983, Liu 1992). So LAPACK and BLAS do nearly all the arithmetic.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _LEAF = 150
-"""Nodes that are not parted any more."""
+"""Number of nodes up to which they are not divided."""
 
 
 @dataclass(frozen=True)
@@ -93,34 +93,34 @@ def _of_nodes(terms: tuple[csr_array, ...], block: int) -> csr_array:
 
 
 def dissect(graph: csr_array, points: Array) -> Dissection:
-    """Planes across the longest side of the nodes' bounding box; both halves get as many nodes.
+    """An order of elimination by planes across the longest side of the nodes' bounding box, with equally many nodes on both sides.
 
-    graph (n, n), symmetric, which nodes are coupled; points (n, dim).
+    graph (n, n), symmetric, not negative: above 0 where two nodes are coupled; points (n, dim), m.
     """
     pieces: list[Indices] = []
     children: list[tuple[int, ...]] = []
 
-    def part(nodes: Indices) -> int:
+    def divide(nodes: Indices) -> int:
         below, between, above = (
-            _parted(graph, points, nodes) if len(nodes) > _LEAF else (nodes[:0], nodes, nodes[:0])
+            _divided(graph, points, nodes) if len(nodes) > _LEAF else (nodes[:0], nodes, nodes[:0])
         )
-        parts = tuple(part(half) for half in (below, above) if len(half))
+        parts = tuple(divide(half) for half in (below, above) if len(half))
         pieces.append(between)
         children.append(parts)
         return len(pieces) - 1
 
-    part(np.arange(graph.shape[0]))
+    divide(np.arange(graph.shape[0]))
     starts = np.concatenate([[0], np.cumsum([len(piece) for piece in pieces])])
     return Dissection(np.concatenate(pieces), starts, tuple(children))
 
 
-def _parted(graph: csr_array, points: Array, nodes: Indices) -> tuple[Indices, Indices, Indices]:
-    """The nodes below a plane, those above that are coupled to none of them, and those between: the second of three."""
+def _divided(graph: csr_array, points: Array, nodes: Indices) -> tuple[Indices, Indices, Indices]:
+    """The nodes below a plane, those above that are coupled to one below, and the others above."""
     axis = int(np.argmax(np.ptp(points[nodes], axis=0)))
     nodes = nodes[np.argsort(points[nodes, axis], kind="stable")]
     rows = graph[nodes]
     n_between = 0
-    for _ in range(2):  # the second time with the thickness of what is between
+    for _ in range(2):  # the second time so that, without those between, the halves are equal
         n_below = max(1, (len(nodes) - n_between) // 2)
         is_below = np.zeros(graph.shape[0])
         is_below[nodes[:n_below]] = 1
@@ -133,7 +133,7 @@ def _parted(graph: csr_array, points: Array, nodes: Indices) -> tuple[Indices, I
 def _factorized(
     terms: tuple[csr_array, ...], order: Indices, starts: Indices, children: tuple[tuple[int, ...], ...]
 ) -> list[_Front]:
-    """The fronts in the order of elimination. What each adds to its parent lives until that is made."""
+    """The fronts in the order of elimination. A front's update is freed when its parent is assembled."""
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     fronts: list[_Front] = []
@@ -170,7 +170,7 @@ def _factorized(
 
 
 def _entries(rows: csr_array, place: Indices, start: int) -> tuple[Indices, Indices, Array]:
-    """Row, place of the column and value of each entry of the rows, those eliminated before left out."""
+    """Row, place of the column and value of each entry of the rows whose column is not eliminated before them."""
     row = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr))
     column = place[rows.indices]
     kept = column >= start
@@ -179,7 +179,7 @@ def _entries(rows: csr_array, place: Indices, start: int) -> tuple[Indices, Indi
 
 @njit(cache=True)
 def _add(target: Array, added: Array, rows: Indices, columns: Indices) -> None:
-    """target[rows, columns] += added; of what it adds to a symmetric matrix only the lower triangle counts."""
+    """target[rows, columns] += added. Of symmetric matrices only the lower triangle is used."""
     for j in range(len(columns)):
         for i in range(len(rows)):
             target[rows[i], columns[j]] += added[i, j]

@@ -41,7 +41,7 @@ def library() -> ctypes.CDLL | None:
 
 @dataclass(frozen=True)
 class UpperTriangle:
-    """Of a symmetric matrix, by blocks: those at the diagonal and above are stored whole.
+    """The upper triangle of a symmetric matrix, in blocks; those on the diagonal are stored in full.
 
     values (n_blocks, block, block), starts (n_rows + 1,), columns (n_blocks,): rows and columns of blocks
     """
@@ -56,7 +56,7 @@ class UpperTriangle:
 
 
 def upper_triangle(matrix: csr_array, block: int) -> UpperTriangle:
-    """With blocks (block, block); entries of the blocks that are not stored are zeros."""
+    """Of a matrix (n, n) with both triangles, n a multiple of `block`; entries that it does not store become zeros."""
     n_rows = matrix.shape[0] // block
     # scipy's `triu` makes three copies of the matrix on the way.
     rows = np.repeat(np.arange(n_rows, dtype=np.int32), np.diff(matrix.indptr[::block]))

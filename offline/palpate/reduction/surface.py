@@ -17,12 +17,13 @@ Array = NDArray[np.float64]
 
 _LEAST_FIT_FREQUENCIES = 64
 _PENALTY = 1e-4  # over the norm of the states' responses
-_BITS = 12  # of the read-out of a state: 24, and the file takes twice the space
+_BITS = 12
+"""Bits that the read-out of a state keeps below its largest entry; with the 24 of float32 the file takes twice the space."""
 
 
 @dataclass(frozen=True)
 class SurfaceOutput:
-    """displacement = output xi + feedthrough u, m, with the discrete state xi before and the newest input u.
+    """displacement = output xi + feedthrough u, m, with the state xi before the step and the newest input u.
 
     output         (3 n_surface, order), float32
     feedthrough    (3 n_surface, n_inputs), float32
@@ -51,7 +52,7 @@ def fit_surface_output(
     surface_patch_shapes  (3 n_surface, n_inputs), those of the patch displacements
     discrete              the reduced model as it runs at period_s
 
-    The full surface response (patch_shapes - sum_k shapes_k b_k^T h/(s² + mu_k h)) is fitted by
+    The full surface response (surface_patch_shapes - sum_k shapes_k b_k^T h/(s² + mu_k h)) is fitted by
     output (z - A)^-1 B + feedthrough, z = e^{s T}: linear in the unknowns, real and imaginary part at once. A small penalty on
     the read-out (Tikhonov) keeps states apart that are alike in the band.
 
@@ -94,7 +95,7 @@ def fit_surface_output(
 
 
 def _rounded(output: Array) -> Array:
-    """To some ten-thousandth of the largest displacement that the same state makes: a compressed file takes half the space."""
+    """Rounded to about a ten-thousandth of the largest displacement that the same state makes, so that the file compresses better."""
     _, exponent = np.frexp(np.abs(output).max(axis=0))
     return np.asarray(np.ldexp(np.round(np.ldexp(output, _BITS - exponent)), exponent - _BITS))
 
