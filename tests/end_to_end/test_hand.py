@@ -21,7 +21,7 @@ from palpate_view.surface import Hit
 UP = np.array([0.0, 0.0, 1.0])
 MIDDLE = Hit(np.zeros(3), UP)
 PAGE, OTHER_PAGE = 1, 2
-GRIP = Grip(PAGE, "tip", radius_m=0.004, friction=0.2)
+GRIP = Grip(PAGE, "tip", radius_m=0.0045, friction=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +66,11 @@ def test_it_presses_with_the_tool_that_was_asked_for_and_lets_go(
     endpoint: str, connect: Callable[..., Any]
 ) -> None:
     with connect(endpoint) as client, hand_on(endpoint) as (hand, told), living(hand, PAGE):
-        assert hand.take(GRIP, press_surface(MIDDLE, np.zeros(3), 0.004, 0.003))
+        assert hand.take(GRIP, press_surface(MIDDLE, np.zeros(3), 0.0045, 0.003))
         pressed = client.force_when(lambda m: newtons(m) > 0.1 and m["force_scale"][0] == 1, "a force")
         assert pressed["flags"][0] & Flags.IN_CONTACT
         tool = client.next_status()["tools"]["tip"]
-        assert (tool["radius_m"], tool["friction"]) == (0.004, 0.2)
+        assert (tool["radius_m"], tool["friction"]) == (0.0045, 0.2)
         # 3 mm below the plane, when the smoothing has arrived
         client.force_when(lambda m: abs(m["position_m"][0][2] - 0.001) < 1e-5, "the depth")
         let_go_ns = time.monotonic_ns()
@@ -87,7 +87,7 @@ def test_it_presses_with_the_tool_that_was_asked_for_and_lets_go(
 
 def test_held_tissue_is_pulled(endpoint: str, connect: Callable[..., Any]) -> None:
     with connect(endpoint) as client, hand_on(endpoint) as (hand, _), living(hand, PAGE):
-        hand.take(GRIP, grab_surface(MIDDLE, np.zeros(3), 0.004))
+        hand.take(GRIP, grab_surface(MIDDLE, np.zeros(3), 0.0045))
         client.force_when(lambda m: m["flags"][0] & Flags.ATTACHED, "a hold")
         hand.aim(PAGE, lambda gesture: moved(gesture, np.array([0.0, 0.0, 0.004])))
         client.force_when(
@@ -122,7 +122,7 @@ def test_another_page_and_another_client_are_told(endpoint: str, connect: Callab
 
 def test_a_place_beyond_the_workspace_is_told(endpoint: str, wait_for: Callable[..., Any]) -> None:
     with hand_on(endpoint) as (hand, told), living(hand, PAGE):
-        hand.take(GRIP, press_surface(Hit(np.array([0.5, 0.0, 0.0]), UP), np.zeros(3), 0.004, 0.003))
+        hand.take(GRIP, press_surface(Hit(np.array([0.5, 0.0, 0.0]), UP), np.zeros(3), 0.0045, 0.003))
         wait_for(lambda: told, "words")
         assert "workspace ends at 100 mm" in told[0]
         wait_for(lambda: hand.grip is None, "the end")
