@@ -72,7 +72,7 @@ def test_it_presses_with_the_tool_that_was_asked_for_and_lets_go(
         tool = client.next_status()["tools"]["tip"]
         assert (tool["radius_m"], tool["friction"]) == (0.0045, 0.2)
         # 3 mm below the plane, when the smoothing has arrived
-        client.force_when(lambda m: abs(m["position_m"][0][2] - 0.001) < 1e-5, "the depth")
+        client.force_when(lambda m: abs(m["position_m"][0][2] - 0.0015) < 1e-5, "the depth")
         let_go_ns = time.monotonic_ns()
         hand.let_go(OTHER_PAGE)
         assert hand.grip is GRIP
