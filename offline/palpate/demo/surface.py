@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -89,12 +90,16 @@ def slide(
     path = surface_path(model, seconds)
     velocity: Array = np.asarray(np.gradient(path, model.period_s, axis=0))
     messages: list[dict[str, Any]] = []
+    # A full collection looks at all objects of the build, for tenths of a second, in which no command is sent.
+    gc.collect()
+    gc.freeze()
     with Connection(endpoint, name="demo") as connection, Tool(connection, tool.name) as moved:
         index = connection.description.index(tool.name)
         connection.on_force(lambda message, arrival_ns: messages.append(message))
         for i in steps(seconds, model.period_s):
             moved.move(path[i].tolist(), velocity[i].tolist())
         status = connection.next_status(_STATUS_WAIT_S)
+    gc.unfreeze()
     client = moved.contract.summary()
     progress.note(f"{client['commands_answered']:,} of {client['commands_sent']:,} commands answered")
     if len(messages) < 2 or status is None:
