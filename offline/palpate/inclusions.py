@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 
 _SAMPLES_A_SPACING = 2
 
+_MOST_NODES = 1e6
+"""On the surface of an inclusion: more are beyond any machine, and a spacing that asks for them is a mistake."""
+
 _LARGEST_LOSS = 0.1
 """Of an inclusion's volume: what the cells inside may lack or have too much before the build warns."""
 
@@ -62,15 +65,33 @@ def with_inclusions(config: Config, folder: Path, cloud: NodeCloud, warn: Callab
 
 
 def finer_around_inclusions(config: Config, folder: Path) -> tuple[RefinedArea, ...]:
-    """The surfaces of the inclusions that ask for finer nodes. Raises FileNotFoundError, SurfaceError."""
+    """The surfaces of the inclusions that ask for finer nodes.
+
+    Raises FileNotFoundError, SurfaceError; ValueError naming an inclusion whose spacing asks for millions of nodes.
+    """
     geometry = config.geometry
     if not isinstance(geometry, SurfaceGeometry):
         return ()
-    return tuple(
-        RefinedArea(*_skin(inclusion, inclusion.spacing_m, folder), inclusion.spacing_m, geometry.growth)
-        for inclusion in config.inclusion
-        if inclusion.spacing_m is not None
-    )
+    areas = []
+    for index, inclusion in enumerate(config.inclusion):
+        if (spacing := inclusion.spacing_m) is None:
+            continue
+        nodes = _area(inclusion, folder) / spacing**2
+        if nodes > _MOST_NODES:
+            raise ValueError(
+                f"inclusion[{index}].spacing_m = {spacing:g}: would put {nodes:.2g} nodes on its surface, expected a larger "
+                "spacing, in m"
+            )
+        areas.append(RefinedArea(*_skin(inclusion, spacing, folder), spacing, geometry.growth))
+    return tuple(areas)
+
+
+def _area(inclusion: Inclusion, folder: Path) -> float:
+    """m²"""
+    if isinstance(inclusion, SphereInclusion):
+        return float(4 * np.pi * inclusion.radius_m**2)
+    surface = load_surface(folder / inclusion.file, inclusion.file_unit).surface
+    return float(triangle_normals(surface)[1].sum())
 
 
 def _depth_and_volume(inclusion: Inclusion, folder: Path, points: Array) -> tuple[Array, float]:
@@ -85,7 +106,7 @@ def _depth_and_volume(inclusion: Inclusion, folder: Path, points: Array) -> tupl
 def _skin(inclusion: Inclusion, spacing_m: float, folder: Path) -> tuple[Array, float]:
     """Samples (n, 3) of the inclusion's surface, m, half a spacing apart, and its area, m²."""
     if isinstance(inclusion, SphereInclusion):
-        area = 4 * np.pi * inclusion.radius_m**2
+        area = _area(inclusion, folder)
         count = int(np.ceil(area * (_SAMPLES_A_SPACING / spacing_m) ** 2))
         return np.asarray(inclusion.center_m) + inclusion.radius_m * directions(count), area
     surface = load_surface(folder / inclusion.file, inclusion.file_unit).surface

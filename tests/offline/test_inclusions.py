@@ -171,6 +171,11 @@ def test_a_mistake_is_named(keys: dict[str, Any], message: str) -> None:
         check_config(changed(**keys), "scene")
 
 
+def test_a_spacing_that_asks_for_millions_of_nodes_is_refused_before_they_are_made(folder: Path) -> None:
+    with pytest.raises(ValueError, match=r"inclusion\[0\].spacing_m = 1e-06: would put 8e\+08 nodes"):
+        expected_size(check_config(changed(spacing_m=1e-6), "scene"), folder)
+
+
 def test_collocation_and_uniform_clouds_refuse_what_they_cannot_do() -> None:
     scene = SCENE | {"discretization": {"method": "collocation"}, "reduction": {"method": "tbr", "order": 10}}
     with pytest.raises(ConfigError, match=r"'collocation': \[\[inclusion\]\] needs 'conservative'"):
