@@ -175,7 +175,8 @@ def surface_body(
         f"{cloud.n_nodes:,} nodes, {int(cloud.boundary.sum()):,} on the surface, {len(fixed)} fixed"
     )
     support = config.discretization.support_radius
-    needed = _require_memory(cloud, _guess(config, cloud), support)
+    guess = _guess(config, cloud)
+    needed = _require_memory(cloud, guess, support)
     progress("assembly, conservative")
     unit = cache.kept(
         "body", keys.body, lambda: conservative.assemble(cloud, material.unit, fixed, [], support)
@@ -183,7 +184,7 @@ def surface_body(
     body = unit.scaled(material.youngs_modulus_pa, material.density_kg_per_m3)
     progress.note(f"memory needed about {needed / 2**30:.1f} GiB")
     touched = _touched(config, cloud, fixed, body.basis.value)
-    n_solves = int(_SURFACE_SOLVES * _guess(config, cloud)) + 3 * len(touched.nodes)
+    n_solves = int(_SURFACE_SOLVES * guess) + 3 * len(touched.nodes)
     key = key_of(keys.surface, fingerprint(config, folder))
     return SurfaceBody(cloud, touched, functools.cache(lambda: hold(body, fixed, n_solves=n_solves)), key)
 

@@ -72,26 +72,11 @@ def finer_around_inclusions(config: Config, folder: Path) -> tuple[RefinedArea, 
     geometry = config.geometry
     if not isinstance(geometry, SurfaceGeometry):
         return ()
-    areas = []
-    for index, inclusion in enumerate(config.inclusion):
-        if (spacing := inclusion.spacing_m) is None:
-            continue
-        nodes = _area(inclusion, folder) / spacing**2
-        if nodes > _MOST_NODES:
-            raise ValueError(
-                f"inclusion[{index}].spacing_m = {spacing:g}: would put {nodes:.2g} nodes on its surface, expected a larger "
-                "spacing, in m"
-            )
-        areas.append(RefinedArea(*_skin(inclusion, spacing, folder), spacing, geometry.growth))
-    return tuple(areas)
-
-
-def _area(inclusion: Inclusion, folder: Path) -> float:
-    """m²"""
-    if isinstance(inclusion, SphereInclusion):
-        return float(4 * np.pi * inclusion.radius_m**2)
-    surface = load_surface(folder / inclusion.file, inclusion.file_unit).surface
-    return float(triangle_normals(surface)[1].sum())
+    return tuple(
+        _finer_around(f"inclusion[{index}]", inclusion, inclusion.spacing_m, geometry.growth, folder)
+        for index, inclusion in enumerate(config.inclusion)
+        if inclusion.spacing_m is not None
+    )
 
 
 def _depth_and_volume(inclusion: Inclusion, folder: Path, points: Array) -> tuple[Array, float]:
@@ -103,14 +88,28 @@ def _depth_and_volume(inclusion: Inclusion, folder: Path, points: Array) -> tupl
     return depth_inside(points, surface), enclosed_volume(surface)
 
 
-def _skin(inclusion: Inclusion, spacing_m: float, folder: Path) -> tuple[Array, float]:
-    """Samples (n, 3) of the inclusion's surface, m, half a spacing apart, and its area, m²."""
+def _finer_around(
+    name: str, inclusion: Inclusion, spacing_m: float, growth: float, folder: Path
+) -> RefinedArea:
+    """The inclusion's surface, with samples half a spacing apart."""
     if isinstance(inclusion, SphereInclusion):
-        area = _area(inclusion, folder)
+        area = 4 * np.pi * inclusion.radius_m**2
+        _require_possible(name, area, spacing_m)
         count = int(np.ceil(area * (_SAMPLES_A_SPACING / spacing_m) ** 2))
-        return np.asarray(inclusion.center_m) + inclusion.radius_m * directions(count), area
+        points = np.asarray(inclusion.center_m) + inclusion.radius_m * directions(count)
+        return RefinedArea(points, area, spacing_m, growth)
     surface = load_surface(folder / inclusion.file, inclusion.file_unit).surface
+    area = float(triangle_normals(surface)[1].sum())
+    _require_possible(name, area, spacing_m)
     samples, _ = sample_elements(
         surface.vertices, surface.triangles, lambda p: np.full(len(p), spacing_m), 1 / _SAMPLES_A_SPACING
     )
-    return samples.points, float(triangle_normals(surface)[1].sum())
+    return RefinedArea(samples.points, area, spacing_m, growth)
+
+
+def _require_possible(name: str, area_m2: float, spacing_m: float) -> None:
+    nodes = area_m2 / spacing_m**2
+    if nodes > _MOST_NODES:
+        raise ValueError(
+            f"{name}.spacing_m = {spacing_m:g}: would put {nodes:.2g} nodes on its surface, expected a larger spacing, in m"
+        )

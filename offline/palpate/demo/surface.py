@@ -93,13 +93,15 @@ def slide(
     # A full collection looks at all objects of the build, for tenths of a second, in which no command is sent.
     gc.collect()
     gc.freeze()
-    with Connection(endpoint, name="demo") as connection, Tool(connection, tool.name) as moved:
-        index = connection.description.index(tool.name)
-        connection.on_force(lambda message, arrival_ns: messages.append(message))
-        for i in steps(seconds, model.period_s):
-            moved.move(path[i].tolist(), velocity[i].tolist())
-        status = connection.next_status(_STATUS_WAIT_S)
-    gc.unfreeze()
+    try:
+        with Connection(endpoint, name="demo") as connection, Tool(connection, tool.name) as moved:
+            index = connection.description.index(tool.name)
+            connection.on_force(lambda message, arrival_ns: messages.append(message))
+            for i in steps(seconds, model.period_s):
+                moved.move(path[i].tolist(), velocity[i].tolist())
+            status = connection.next_status(_STATUS_WAIT_S)
+    finally:
+        gc.unfreeze()
     client = moved.contract.summary()
     progress.note(f"{client['commands_answered']:,} of {client['commands_sent']:,} commands answered")
     if len(messages) < 2 or status is None:
