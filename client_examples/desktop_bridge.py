@@ -12,6 +12,7 @@ import math
 import os
 import signal
 import sys
+import time
 from dataclasses import dataclass
 
 from palpate_client import bridge
@@ -26,7 +27,7 @@ except ModuleNotFoundError:
 PIXEL_M, NOTCH_M, SPEED_M_PER_S, TRIGGER_M = 1e-4, 5e-4, 0.02, 0.01
 ABOVE_M, DEEPEST_M, ASIDE_M = 5e-3, 0.015, 0.1  # the tip stays between these
 FULL_N = 3.0  # where the bar ends and the rumble is strongest
-PERIOD_S, FRAME_S = 1e-3, 1 / 50
+FRAME_S = 1 / 50
 STICK_X, STICK_Y, TRIGGER = 0, 1, 5
 DEAD_ZONE = 0.1
 
@@ -70,18 +71,20 @@ class Desktop:
         self.gamepad = pygame.joystick.Joystick(0) if pygame.joystick.get_count() else None
         self.position_m = (0.0, 0.0, ABOVE_M)
         self.force_n = bridge.NO_FORCE
-        self.looks = 0
+        self.read_at_s = self.drawn_at_s = time.monotonic()
 
     def render(self, force_n):
         """Draw and rumble fifty times a second; a rumble ends by itself when no further one comes."""
+        ended = force_n == bridge.NO_FORCE != self.force_n
         self.force_n = force_n
-        self.looks += 1
-        if self.looks % round(FRAME_S / PERIOD_S) and force_n != bridge.NO_FORCE:
+        due = time.monotonic() - self.drawn_at_s >= FRAME_S
+        if not due and not ended:
             return
         share = min(1.0, math.hypot(*force_n) / FULL_N)
         if self.gamepad:
             self.gamepad.rumble(share, share, round(2000 * FRAME_S))
-        if self.looks % round(FRAME_S / PERIOD_S) == 0:
+        if due:
+            self.drawn_at_s = time.monotonic()
             self.draw(share)
 
     def draw(self, share):
@@ -97,7 +100,8 @@ class Desktop:
         inputs = read_inputs(pygame.event.get(), self.gamepad)
         if inputs.ended:
             signal.raise_signal(signal.SIGINT)
-        self.position_m = moved(self.position_m, inputs, PERIOD_S)
+        before_s, self.read_at_s = self.read_at_s, time.monotonic()
+        self.position_m = moved(self.position_m, inputs, min(self.read_at_s - before_s, FRAME_S))
         x, y, z = self.position_m
         return (x, y, z - TRIGGER_M * inputs.trigger), None
 

@@ -9,11 +9,12 @@ as they are. Never run on hardware: it is none.
 
 import math
 import sys
+import time
 
 from palpate_client import bridge
 from palpate_client.arguments import positive
 
-PERIOD_S = 1e-3
+LONGEST_STEP_S = 5e-3
 
 
 class SimulatedDevice:
@@ -27,13 +28,15 @@ class SimulatedDevice:
         self.mass_kg, self.damping_n_s_per_m = mass_kg, damping_n_s_per_m
         self.hand_n_per_m, self.reach_mm = hand_n_per_m, reach_mm
         self.z_mm, self.speed_mm_per_s, self.force_n, self.time_s = 0.0, 0.0, 0.0, 0.0
+        self.read_at_s = time.monotonic()
 
     def render(self, force_n):
         """The force on the hand from now on; a real driver sends it to the motors, which keep it."""
         self.force_n = force_n[2]
 
     def read(self):
-        self.move(PERIOD_S)
+        before_s, self.read_at_s = self.read_at_s, time.monotonic()
+        self.move(min(self.read_at_s - before_s, LONGEST_STEP_S))
         return (0.0, 0.0, 1e-3 * self.z_mm), (0.0, 0.0, 1e-3 * self.speed_mm_per_s)
 
     def move(self, seconds):

@@ -40,59 +40,80 @@ class Inverse3:
     right, outward = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 
     def __init__(self, url):
-        self.url, self.opened = url, contextlib.ExitStack()
+        self.url, self.guard, self.opened = url, None, contextlib.ExitStack()
         try:
             self.socket = self.opened.enter_context(open_socket(url))
-            first = json.loads(self.socket.recv(timeout=3.0))
         except (OSError, WebSocketException) as error:
             raise DeviceLost(f"no Inverse service at {url}: {error}") from error
-        if not first.get("inverse3"):
-            raise DeviceLost(f"no Inverse3 is connected to the service at {url}")
-        self.id, status = first["inverse3"][0]["device_id"], first["inverse3"][0].get("status", {})
-        for name in ("power_supply", "calibrated", "ready"):
-            if not status.get(name, True):
-                print(f"warning: the service says of the Inverse3 {self.id}: not {name}", file=sys.stderr)
-        command = (sys.executable, __file__, QUIET, url, self.id)
+        try:
+            self.begin()
+        except DeviceLost:
+            self.close()
+            raise
+
+    def begin(self):
+        with talking(self.url):
+            devices = json.loads(self.socket.recv(timeout=3.0)).get("inverse3")
+            if not devices:
+                raise DeviceLost(f"no Inverse3 is connected to the service at {self.url}")
+            self.id, status = devices[0]["device_id"], devices[0].get("status", {})
+            missing = [name for name in ("power_supply", "calibrated", "ready") if not status.get(name, True)]
+        for name in missing:
+            print(f"warning: the service says of the Inverse3 {self.id}: not {name}", file=sys.stderr)
+        command = (sys.executable, __file__, QUIET, self.url, self.id)
         # In a session of its own: Ctrl-C must not end it before us.
         self.guard = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
-        self.socket.send(force_command(self.id, bridge.NO_FORCE))
+        self.send(bridge.NO_FORCE)
         self.neutral_m, _ = self.read()
 
-    def render(self, force_n):
-        try:
+    def send(self, force_n):
+        with talking(self.url):
             self.socket.send(force_command(self.id, force_n))
+
+    def render(self, force_n):
+        self.send(force_n)
+        try:
             os.write(self.guard.stdin.fileno(), BEAT)
         except BrokenPipeError as error:
             raise DeviceLost("the guard has ended, which would let go of the device for us") from error
-        except WebSocketException as error:
-            raise DeviceLost(f"the Inverse service at {self.url} is gone") from error
 
     def read(self):
         """The newest state: the service sends one for each force."""
-        try:
+        with talking(self.url):
             text = self.socket.recv(timeout=GONE_S)
             with contextlib.suppress(TimeoutError):
                 while True:
                     text = self.socket.recv(timeout=0)
-        except TimeoutError as error:
-            raise DeviceLost(f"the Inverse service at {self.url} is silent") from error
-        except WebSocketException as error:
-            raise DeviceLost(f"the Inverse service at {self.url} is gone") from error
-        states = {device["device_id"]: device["state"] for device in json.loads(text).get("inverse3", [])}
-        if self.id not in states:
-            raise DeviceLost(f"the Inverse3 {self.id} is no longer connected")
-        return tuple(
-            tuple(states[self.id][name][axis] for axis in "xyz")
-            for name in ("cursor_position", "cursor_velocity")
-        )
+            states = {device["device_id"]: device["state"] for device in json.loads(text).get("inverse3", [])}
+            if self.id not in states:
+                raise DeviceLost(f"the Inverse3 {self.id} is no longer connected")
+            return tuple(
+                tuple(float(states[self.id][name][axis]) for axis in "xyz")
+                for name in ("cursor_position", "cursor_velocity")
+            )
 
     def close(self):
         with contextlib.suppress(OSError, WebSocketException):
             self.opened.close()
+        if self.guard is None:
+            return
         with contextlib.suppress(OSError):
             os.write(self.guard.stdin.fileno(), END)
             self.guard.stdin.close()
         self.guard.wait()
+
+
+@contextlib.contextmanager
+def talking(url):
+    """Tells in plain words what goes wrong between the service and us."""
+    try:
+        yield
+    except TimeoutError as error:
+        raise DeviceLost(f"the Inverse service at {url} is silent") from error
+    except (OSError, WebSocketException) as error:
+        raise DeviceLost(f"the Inverse service at {url} is gone") from error
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise DeviceLost(f"the Inverse service at {url} sent what can't be read: {error!r}") from error
 
 
 def open_socket(url):

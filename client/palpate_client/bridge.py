@@ -67,7 +67,8 @@ def run(open_device: Callable[[], Device], options: argparse.Namespace) -> int:
     try:
         with connection_for(options) as connection, contextlib.closing(open_device()) as device:
             frame = frame_over(device, connection.description.tools[0])
-            tool = Tool(connection, frame=frame, silence_s=options.silence_s)
+            tip = {"radius_m": options.radius_m, "friction": options.friction}
+            tool = Tool(connection, frame=frame, silence_s=options.silence_s, **tip)
             try:
                 with tool:
                     profile = options.device or device.profile
@@ -94,6 +95,10 @@ def parser(description: str, duration_s: float = math.inf) -> argparse.ArgumentP
     parser.add_argument(
         "--silence-s", type=positive, default=0.1, help="without a force for so long, let go, s (%(default)s)"
     )
+    parser.add_argument(
+        "--radius-m", type=positive, help="of the tip, for a surface model (default: the file's)"
+    )
+    parser.add_argument("--friction", type=float, help="of the tip, the same")
     until = "until Ctrl-C" if math.isinf(duration_s) else "%(default)s"
     parser.add_argument("--duration-s", type=positive, default=duration_s, help=f"how long, s ({until})")
     return parser

@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -186,8 +186,10 @@ def test_inputs_move_the_tip_and_stay_in_their_box(desktop: ModuleType) -> None:
     assert far == (desktop.ASIDE_M, -desktop.ASIDE_M, -desktop.DEEPEST_M)
 
 
-def test_events_and_a_gamepad_become_inputs(desktop: ModuleType) -> None:
+def test_events_and_a_gamepad_become_inputs(desktop: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     pygame = desktop.pygame
+    now_ms = [0]
+    monkeypatch.setattr(desktop, "time", SimpleNamespace(monotonic=lambda: 1e-3 * now_ms[0]))
     device = desktop.Desktop()
     try:
         for kind, values in (
@@ -196,11 +198,13 @@ def test_events_and_a_gamepad_become_inputs(desktop: ModuleType) -> None:
         ):
             pygame.event.post(pygame.event.Event(kind, **values))
         device.gamepad = Gamepad(x=0.05, y=-1.0, trigger=0.0)
+        now_ms[0] += 1
         position, velocity = device.read()
         assert velocity is None
-        # 10 pixels right, 5 up, and one period of the stick, whose rest position is not quite 0; three notches and half the trigger.
+        # 10 pixels right, 5 up, and 1 ms of the stick, whose rest position is not quite 0; three notches and half the trigger.
         assert position == pytest.approx((0.001, 0.0005 + 2e-5, desktop.ABOVE_M - 0.0015 - 0.005))
         for _ in range(40):
+            now_ms[0] += 1
             device.render((0.0, 0.0, 1.5))
         device.render((0.0, 0.0, 0.0))
         assert device.gamepad.rumbled[:-1] == [(0.5, 0.5, 40)] * 2

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import importlib.util
 import math
 import os
+import re
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.sync.server import ServerConnection, serve
 
 from inverse_service import InverseService
 from palpate.model_file import SurfaceModel
 from palpate_client import DeviceLost
 from palpate_client.local_server import free_endpoint
 
-pytest.importorskip("websockets")
 EXAMPLES = Path(__file__).parents[2] / "client_examples"
 NO_FORCE = (0.0, 0.0, 0.0)
 START_M = (0.02, -0.11, 0.08)  # where the hand is when the bridge starts
@@ -211,6 +215,52 @@ def test_a_device_that_is_not_there_or_is_unplugged_is_told(haply: Any, service:
             device.read()
     finally:
         device.close()
+
+
+@contextlib.contextmanager
+def serving(talk: Callable[[ServerConnection], None]) -> Iterator[str]:
+    """The address of a service that does this with each client."""
+    with serve(talk, "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    ("answer", "says"),
+    [
+        ("[]", "sent what can't be read: AttributeError"),
+        ("{", "sent what can't be read: JSONDecodeError"),
+        ('{"inverse3": [{"device_id": "04a1"}]}', "sent what can't be read: KeyError('state')"),
+        (
+            '{"inverse3": [{"device_id": "04a1", "state": {"cursor_position": {"x": null}}}]}',
+            "sent what can't be read: TypeError",
+        ),
+        (None, "is gone"),
+    ],
+)
+def test_a_service_that_says_something_else_or_hangs_up_is_told(
+    haply: Any, answer: str | None, says: str
+) -> None:
+    """Once in the first message, and once after a good one."""
+
+    def talk(client: ServerConnection, first: str) -> None:
+        client.send(first)
+        for _ in client:
+            if answer is None:
+                client.close_socket()
+                return
+            client.send(answer)
+
+    good = '{"inverse3": [{"device_id": "04a1"}]}'
+    for first in {good, answer or good}:
+        with (
+            serving(functools.partial(talk, first=first)) as url,
+            pytest.raises(DeviceLost, match=re.escape(says)),
+        ):
+            haply.Inverse3(url)
 
 
 def test_without_its_guard_a_bridge_ends_and_can_still_let_go(haply: Any, service: InverseService) -> None:
