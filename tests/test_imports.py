@@ -38,6 +38,7 @@ PROGRAMS = {
     "palpate_server.recording.replay": ("palpate_client.arguments",),
     "palpate_server.diagnostics": ("palpate_client",),
     "palpate.demo": ("palpate_client", "palpate_server.simulation"),
+    "palpate.notebook": ("palpate_server.simulation",),
     "palpate.cli": ("palpate_client",),
     "palpate.commands": ("palpate_client",),
     "palpate.versions": ("palpate_client",),

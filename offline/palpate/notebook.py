@@ -26,6 +26,7 @@ from palpate.report import accuracy_text
 from palpate.scene.quantities import SystemMethod
 from palpate.scene.schema import Config
 from palpate.scene_cloud import shown_surface
+from palpate_server.simulation import Simulation
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,7 +36,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Press:
-    """A contact of a patch model that was pressed in along its inward normal.
+    """A contact of a patch model, or a tool of a surface model, that was pressed in along the inward normal.
 
     time_s   (n,), s
     depth_m  (n,), m, of the tip
@@ -48,19 +49,22 @@ class Press:
 
 
 def press(
-    model: ReducedModel,
+    model: ReducedModel | SurfaceModel,
     depth_m: float,
     *,
     ramp_s: float = 0.1,
     hold_s: float = 0.9,
     contact: int = 0,
 ) -> Press:
-    """Press a contact in by `depth_m` in `ramp_s`, hold it for `hold_s`; the others stay. Steps as the server does.
+    """Press a contact or tool in by `depth_m` in `ramp_s`, hold it for `hold_s`; the others stay. Steps as the server does.
 
-    Raises ValueError for a contact that the model does not have, or times that hold no step.
+    A tool begins where it touches the surface point nearest to its home; it is held by the spring of `Simulation`.
+
+    Raises ValueError for a contact or tool that the model does not have, or times that hold no step.
     """
-    if not 0 <= contact < len(model.contacts):
-        raise ValueError(f"contact = {contact}: expected 0 to {len(model.contacts) - 1}")
+    count = len(model.tools if isinstance(model, SurfaceModel) else model.contacts)
+    if not 0 <= contact < count:
+        raise ValueError(f"contact = {contact}: expected 0 to {count - 1}")
     if ramp_s < model.period_s or hold_s < 0:
         raise ValueError(
             f"ramp_s = {ramp_s:g}, hold_s = {hold_s:g}: expected a ramp of at least a period, {model.period_s:g} s, and no "
@@ -68,12 +72,29 @@ def press(
         )
     time: Array = model.period_s * np.arange(1 + round((ramp_s + hold_s) / model.period_s), dtype=np.float64)
     depth = depth_m * np.minimum(time / ramp_s, 1.0)
+    if isinstance(model, SurfaceModel):
+        return Press(time, depth, _on_tool(model, contact, depth))
+    return Press(time, depth, _on_contact(model, contact, depth))
+
+
+def _on_contact(model: ReducedModel, contact: int, depth_m: Array) -> Array:
+    """(n,), N: the force along the outward normal at each depth (n,), m, one a period."""
     normal = np.asarray(model.contacts[contact].normal)
     own = slice(3 * contact, 3 * contact + 3)
-    moved = np.zeros((len(time), model.n_inputs))
-    moved[:, own] = -depth[:, None] * normal
+    moved = np.zeros((len(depth_m), model.n_inputs))
+    moved[:, own] = -depth_m[:, None] * normal
     holding, _ = step_through(model.discrete, moved)
-    return Press(time, depth, -holding[:, own] @ normal)
+    return np.asarray(-holding[:, own] @ normal)
+
+
+def _on_tool(model: SurfaceModel, index: int, depth_m: Array) -> Array:
+    """The same for the tool of this index."""
+    tool = model.tools[index]
+    nearest = int(np.argmin(np.linalg.norm(model.points - tool.home_m, axis=1)))
+    point, normal = model.points[nearest], model.normals[nearest]
+    simulation = Simulation(model)
+    centers = point + (tool.radius_m - depth_m)[:, None] * normal
+    return np.array([simulation.step({tool.name: center})[tool.name].force_n @ normal for center in centers])
 
 
 def plot_press(pressed: Press) -> Figure:

@@ -59,6 +59,19 @@ def test_a_held_press_relaxes_to_the_stiffness_at_rest(folder):
         notebook.press(model, depth_m=0.002, ramp_s=0.0)
 
 
+def test_a_tool_pressed_into_a_surface_model_is_pushed_out_the_more_the_deeper_and_the_tissue_relaxes(
+    make_surface_model,
+):
+    model = make_surface_model()
+    deep, shallow = (notebook.press(model, depth_m=depth, hold_s=2.0) for depth in (0.002, 0.001))
+    for pressed in (deep, shallow):
+        assert pressed.force_n[0] == 0
+        assert 0 < pressed.force_n[-1] < np.max(pressed.force_n)
+    assert deep.force_n[-1] > 2 * shallow.force_n[-1]
+    with pytest.raises(ValueError, match="contact = 9"):
+        notebook.press(model, depth_m=0.001, contact=9)
+
+
 def test_the_response_that_runs_is_the_full_ones_in_the_band(folder):
     _, model = folder
     full, running = (line.get_xydata() for line in notebook.plot_response(model).axes[0].lines)
