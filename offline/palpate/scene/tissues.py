@@ -68,7 +68,7 @@ TISSUES: dict[str, Preset] = {
     ),
     "liver": Preset(
         Material(5400.0, 0.45, 1060.0, PronySeries((0.5, 0.3), (0.58, 0.004))),
-        "the liver of the shipped scenes: its stiffness is measured, its relaxation is not",
+        "the liver of most shipped scenes: its stiffness is measured, its relaxation is not",
         "shear modulus 1.8 kPa, so E = 5.4 kPa as for an incompressible body",
         None,
         "+- 0.4 kPa of the shear modulus",
