@@ -24,7 +24,7 @@ from numba import njit
 
 from palpate.model_file import SurfaceModel, ToolShape, load_model
 from palpate_server import simulation  # registers the image
-from palpate_server.coupling import sphere_contact
+from palpate_server.coupling import sphere_contact, spheres
 from palpate_server.diagnostics.sample_surface import half_space_model
 from palpate_server.realtime.clock import monotonic_ns
 from palpate_server.realtime.native_image import make_image, view
@@ -72,7 +72,7 @@ def slides(model: SurfaceModel, ticks: int) -> np.ndarray:
 
 
 def row(name: str, model: SurfaceModel, ticks: int) -> None:
-    contact = sphere_contact.make(model)
+    contact = spheres.make(model)
     image, n = make_image(contact), len(model.tools)
     positions = slides(model, ticks)
     nanoseconds, sizes = np.zeros(ticks, np.int64), np.zeros((ticks, 3), np.int64)

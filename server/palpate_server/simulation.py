@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from palpate.model_file import SurfaceModel
 from palpate_client.wire import Flags
-from palpate_server.coupling import sphere_contact
-from palpate_server.coupling.sphere_contact import DEFAULT_STIFFNESS_N_PER_M
+from palpate_server.coupling import sphere_contact, spheres
+from palpate_server.coupling.spheres import DEFAULT_STIFFNESS_N_PER_M
 from palpate_server.realtime import native_image
 from palpate_server.realtime.compiled import compiled
 from palpate_server.realtime.native_image import Image, view
@@ -73,11 +73,11 @@ class Simulation:
     ) -> None:
         self.model = model
         self._index = {tool.name: i for i, tool in enumerate(model.tools)}
-        self._contact = sphere_contact.make(model, self._stiffnesses(stiffness_n_per_m))
+        self._contact = spheres.make(model, self._stiffnesses(stiffness_n_per_m))
         self._image = native_image.make_image(self._contact)
         n = len(self._index)
         self._positions = np.array([tool.home_m for tool in model.tools], float).reshape(n, 3)
-        self._wanted = np.full(n, sphere_contact.LIFTED)
+        self._wanted = np.full(n, spheres.LIFTED)
         self._forces, self._reactions = np.zeros((n, 3)), np.zeros(n, REACTION)
         self._shown = np.zeros(self._contact.shown_size())
 
@@ -90,9 +90,9 @@ class Simulation:
         wanted = {self._tool(name): _position(name, values) for name, values in positions_m.items()}
         for i in range(len(self._index)):
             if i not in wanted:
-                self._wanted[i] = sphere_contact.LIFTED
-            elif self._wanted[i] == sphere_contact.LIFTED:
-                self._wanted[i] = sphere_contact.TOUCHING
+                self._wanted[i] = spheres.LIFTED
+            elif self._wanted[i] == spheres.LIFTED:
+                self._wanted[i] = spheres.TOUCHING
         for i, position in wanted.items():
             self._positions[i] = position
         _advance(self._image, self._positions, self._wanted, self._forces, self._reactions)
@@ -100,16 +100,16 @@ class Simulation:
 
     def attach(self, tool: str) -> None:
         """From the next step on the tool holds on to the points it presses, or to the first that it will."""
-        self._wanted[self._tool(tool)] = sphere_contact.GRABBING
+        self._wanted[self._tool(tool)] = spheres.GRABBING
 
     def release(self, tool: str) -> None:
         """From the next step on the tool lets go: what it pulled with fades within some 0.1 s."""
-        self._wanted[self._tool(tool)] = sphere_contact.TOUCHING
+        self._wanted[self._tool(tool)] = spheres.TOUCHING
 
     def positions(self) -> Floats:
         """(n_points, 3), m: the surface as it is now."""
         _save_shown(self._image, self._shown)
-        return self.model.points + sphere_contact.shown(self.model, self._shown).reshape(-1, 3)
+        return self.model.points + spheres.shown(self.model, self._shown).reshape(-1, 3)
 
     def energy(self) -> tuple[float, float]:
         """J, stored in the body, and dissipated in it since the simulation began."""
@@ -176,12 +176,12 @@ def _advance(
 
 @compiled
 def _save(image: Image, state: Floats) -> None:
-    sphere_contact.save(view(image), state, 0)
+    spheres.save(view(image), state, 0)
 
 
 @compiled
 def _save_shown(image: Image, state: Floats) -> None:
-    sphere_contact.save_shown(view(image), state)
+    spheres.save_shown(view(image), state)
 
 
 @compiled
@@ -189,4 +189,4 @@ def _ledger(image: Image, out: Floats) -> None:
     sphere_contact.ledger(view(image), out)
 
 
-native_image.register("sphere_contact", sphere_contact.empty(1))
+native_image.register("sphere_contact", spheres.empty(1))

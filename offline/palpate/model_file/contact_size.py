@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
 DEPTH = 0.5
 """Depth over radius of the contact. The radius of the contact is sqrt(radius * depth) (Hertz 1882)."""
 
@@ -19,6 +24,11 @@ def contact_radius_m(tool_radius_m: float) -> float:
 def points_in_contact(tool_radius_m: float, spacing_m: float) -> float:
     """About how many points such a contact has, where a point stands for spacing²."""
     return math.pi * contact_radius_m(tool_radius_m) ** 2 / spacing_m**2
+
+
+def smallest_radius_m(spacing_m: Floats) -> Floats:
+    """Radius of the smallest sphere that touches FEWEST_POINTS of points this far apart, m."""
+    return spacing_m * math.sqrt(FEWEST_POINTS / points_in_contact(1.0, 1.0))
 
 
 def small_tool_advice(name: str, radius_m: float, spacing_m: float) -> str | None:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.model_file import ReducedModel, SurfaceModel
-from palpate_server.coupling import fixed_patch, running, settle, sphere_contact
+from palpate_server.coupling import fixed_patch, running, settle, spheres
 from palpate_server.coupling.running import Running, Tip
 from palpate_server.coupling.settle import Touch
-from palpate_server.coupling.sphere_contact import DEFAULT_STIFFNESS_N_PER_M
+from palpate_server.coupling.spheres import DEFAULT_STIFFNESS_N_PER_M
 
 Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -108,7 +108,7 @@ def make_running(model: Model, tips: Sequence[Tip] | None = None) -> Running:
         return _patches(model, None)
     if tips is None:
         tips = tips_of_file(model)
-    contact = sphere_contact.make(model, [tip.stiffness_n_per_m for tip in tips])
+    contact = spheres.make(model, [tip.stiffness_n_per_m for tip in tips])
     contact.tools.radius[:] = [tip.radius_m for tip in tips]
     contact.tools.friction[:] = [tip.friction for tip in tips]
     return running.of_contact(contact, np.array([tip.start_m for tip in tips]))
@@ -139,7 +139,7 @@ def surface_at_rest(model: Model) -> tuple[Floats, NDArray[np.int32]]:
 def shown_displacement(model: Model, state: Floats, displacement: Floats) -> NDArray[np.float32]:
     """(3 n_vertices,), m: of the surface that is shown, from what `running.save_shown` wrote and the tips' displacement."""
     if isinstance(model, SurfaceModel):
-        return sphere_contact.shown(model, state)
+        return spheres.shown(model, state)
     surface = model.surface
     shown = surface.output @ state.astype(np.float32)
     shown += surface.feedthrough @ displacement.ravel().astype(np.float32)

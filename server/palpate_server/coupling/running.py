@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_client.wire import Flags
-from palpate_server.coupling import fixed_patch, sphere_contact
+from palpate_server.coupling import fixed_patch, sphere_contact, spheres
 from palpate_server.coupling.fixed_patch import FixedPatch
-from palpate_server.coupling.sphere_contact import SphereContact
+from palpate_server.coupling.spheres import SphereContact
 from palpate_server.realtime.compiled import compiled
 
 Floats = NDArray[np.float64]
@@ -71,7 +71,7 @@ def empty() -> Running:
 
 def of_patch(patch: FixedPatch) -> Running:
     nowhere = np.zeros((0, 3))
-    return Running(patch, sphere_contact.empty(0), nowhere, nowhere)
+    return Running(patch, spheres.empty(0), nowhere, nowhere)
 
 
 def of_contact(contact: SphereContact, start: Floats) -> Running:
@@ -127,7 +127,7 @@ def set_tip(running: Running, tool: int, settings: Record) -> None:
     if running.start.shape[0] > 0:
         for j in range(3):
             running.start[tool, j] = settings.start_m[j]
-        sphere_contact.set_tool(
+        spheres.set_tool(
             running.contact, tool, settings.radius_m, settings.friction, settings.stiffness_n_per_m
         )
 
@@ -135,14 +135,14 @@ def set_tip(running: Running, tool: int, settings: Record) -> None:
 @compiled
 def put_to_rest(running: Running) -> None:
     fixed_patch.put_to_rest(running.patch)
-    sphere_contact.put_to_rest(running.contact)
+    spheres.put_to_rest(running.contact)
 
 
 @compiled
 def save_shown(running: Running, state: Floats) -> None:
     """Write what the shown surface depends on into `state` (shown_size,)."""
     fixed_patch.save_shown(running.patch, state)
-    sphere_contact.save_shown(running.contact, state)
+    spheres.save_shown(running.contact, state)
 
 
 @compiled
@@ -153,4 +153,4 @@ def save(running: Running, state: Floats, place: int) -> int:
         for j in range(3):
             state[place] = running.start[i, j]
             place += 1
-    return sphere_contact.save(running.contact, state, place)
+    return spheres.save(running.contact, state, place)

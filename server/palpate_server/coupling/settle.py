@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate_server.coupling import running as models
 from palpate_server.coupling.running import Running
-from palpate_server.coupling.sphere_contact import LIFTED
+from palpate_server.coupling.spheres import LIFTED
 from palpate_server.realtime import native_image
 from palpate_server.realtime.compiled import compiled
 from palpate_server.realtime.native_image import Image, make_image, view

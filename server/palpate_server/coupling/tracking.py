@@ -27,20 +27,20 @@ class Tracking(NamedTuple):
     """m points, n tools with n_slots / n slots each.
 
     points, normals (m, 3), at rest; near (m, k), see near_points
+    carried  (m,), m: radius of the smallest sphere that the points around each can carry
     anchor   (n,): a point; complete (n,): 1 when all points near it are watched
     position (n_slots, 3), m: of watched points, as it was found last
     mark     (m,): scratch, zero between uses
-    largest_radius (1,), m: of the spheres that `near` is made for
     """
 
     points: Floats
     normals: Floats
     near: Integers
+    carried: Floats
     anchor: Integers
     complete: Integers
     position: Floats
     mark: Integers
-    largest_radius: Floats
 
 
 @compiled
@@ -78,11 +78,11 @@ def nearest_watched(tracking: Tracking, body: ElasticSurface, center: Floats, fi
 
 @compiled
 def watch_near(
-    tracking: Tracking, body: ElasticSurface, tool: int, busy: Integers, first: int, last: int
+    tracking: Tracking, body: ElasticSurface, tool: int, busy: Integers, gap: Floats, first: int, last: int
 ) -> None:
     """Watch the points near a tool's anchor in its slots, nearest first, at most JOIN new ones.
 
-    busy (n_slots,): not zero for slots that must stay
+    busy (n_slots,): not zero for slots that must stay; gap (n_slots,), m: zero after this for new ones, so that they are looked at
     """
     near, mark, watched = tracking.near[tracking.anchor[tool]], tracking.mark, body.watched
     for k in range(near.size):
@@ -98,13 +98,11 @@ def watch_near(
             continue
         while slot < last and (busy[slot] or (watched[slot] != NOBODY and mark[watched[slot]] != 0)):
             slot += 1
-        if slot == last:
-            break
-        if joined == JOIN:
+        if slot == last or joined == JOIN:
             complete = 0
             break
         elastic_surface.watch(body, slot, point)
-        mark[point] = 2
+        mark[point], gap[slot] = 2, 0.0
         joined += 1
         elastic_surface.place(body, slot)
         for c in range(3):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from palpate_client.wire import Flags
 from palpate_server.coupling import cross_fade
-from palpate_server.coupling.sphere_contact import GRABBING, LIFTED, TOUCHING
+from palpate_server.coupling.spheres import GRABBING, LIFTED, TOUCHING
 from palpate_server.realtime import frames, port, safety
 from palpate_server.realtime.atomics import (
     MAX_READS,

@@ -150,6 +150,30 @@ def test_a_fast_sweep_does_not_lose_the_contact(soft: SurfaceModel) -> None:
     assert all(reaction.n_points > 0 for reaction in sweep)
 
 
+def test_a_fast_sweep_feels_what_a_slow_one_does() -> None:
+    """0.5 m/s beside 0.05 m/s on an elastic half-space: all points are found before they are penetrated."""
+    found = []
+    for n in (600, 60):
+        simulation = Simulation(half_space_model(one_tool(), 15, 3e-3, YOUNG_PA))
+        path(simulation, straight((-0.015, 0.0, 6e-3), (-0.015, 0.0, 2e-3), 100))
+        found.append(forces(path(simulation, straight((-0.015, 0.0, 2e-3), (0.015, 0.0, 2e-3), n)))[:, 2])
+    slow, fast = found[0][9::10], found[1]
+    assert np.abs(fast - slow).max() < 0.05 * slow.max()
+
+
+def test_a_tip_between_points_that_are_far_apart_is_blunter_and_touches() -> None:
+    """A sphere of 5 mm fits between points 12 mm apart; it presses as one of 16.6 mm, the smallest that they carry."""
+    lifted = half_space_model(one_tool(), 9, 0.012, YOUNG_PA)
+    for x, y in ((0.0, 0.0), (6e-3, 0.0), (6e-3, 6e-3), (5e-3, 3e-3)):
+        simulation = Simulation(lifted)
+        pushed = path(simulation, straight((x, y, 6e-3), (x, y, 0.0), 120))  # 5 mm deep
+        assert pushed[-1].n_points >= 1
+        assert largest_step(pushed) < 0.05 * pushed[-1].force_n[2]
+        blunt = replace(lifted, tools=(ToolShape("tip", 0.0166, 0.0, (0.0, 0.0, 0.03)),))
+        as_blunt = path(Simulation(blunt), straight((x, y, 0.0176), (x, y, 0.0116), 120))
+        assert pushed[-1].force_n[2] == pytest.approx(as_blunt[-1].force_n[2], rel=0.03)
+
+
 def test_a_tool_that_begins_inside_is_not_thrown_out(soft: SurfaceModel) -> None:
     simulation = Simulation(soft)
     reactions = path(simulation, np.tile([0.0, 0.0, -3e-3], (200, 1)))

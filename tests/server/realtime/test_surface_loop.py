@@ -251,6 +251,75 @@ def test_another_model_is_faded_in_settled_whatever_its_kind(
             assert record["work_j"] >= -1e-9
 
 
+def check_adversarial_ticks(make_surface_model: Callable[..., SurfaceModel], n: int, seed: int) -> None:
+    """Commands of two tools at random, with gaps, jumps, grips, resets, other limits and other models while they press."""
+    rng = np.random.default_rng(seed)
+    bodies = [make_surface_model(2), make_surface_model(2, softness=4.0)]
+    limits = [Limits(2.0, 60.0, 0.5, 0.1, 0.0), Limits(0.3, 20.0, 0.2, 0.1, 0.0)]
+    loop, soft, fade_ends, strict = Loop(bodies[0], limits[0]), 0, -1, 0
+    state, before = np.zeros((2, 3)), np.zeros((2, 3))
+    silent_until, attach, swaps, resets, felt = np.zeros(2, int), False, 0, 0, 0.0
+    for tick in range(n):
+        state += 0.03 * (rng.normal(size=(2, 3)) * 20 - state)
+        change = rng.random()
+        if change < 0.002:
+            silent_until[rng.integers(2)] = tick + rng.integers(5, 200)
+        elif change < 0.003:
+            state[rng.integers(2)] += rng.normal(size=3) * 20  # a jump, for the limit of the speed
+        elif change < 0.006:
+            attach = not attach
+        elif change < 0.0065:
+            scheduler.reset(loop.image)
+            resets += 1
+        elif change < 0.0085:
+            strict = 1 - strict
+            for i in range(2):
+                scheduler.set_limits(loop.image, i, np.array(limits[strict]))
+                loop.tick({})
+        elif change < 0.0095 and fade_ends < 0:
+            soft, fade_ends = 1 - soft, tick + 100
+            loop.load(bodies[soft], 0.01)
+            swaps += 1
+        if tick == fade_ends:
+            loop.end_fade()
+            fade_ends = -1
+        before = loop.memory.ports["force_n"].copy()
+        rate = loop.memory.settings["max_force_rate_n_per_s"].copy()
+        told = {i: loop.start[i] + 1e-3 * state[i] for i in range(2) if silent_until[i] < tick}
+        records = loop.tick(told, attach)
+        forces = records["force_n"]
+        assert np.all(np.isfinite(forces))
+        steps = np.linalg.norm(forces - before, axis=1)
+        assert np.all(
+            steps <= np.maximum(rate, loop.memory.settings["max_force_rate_n_per_s"]) * 1e-3 * (1 + 1e-9)
+        )
+        stored, dissipated = loop.memory.ledger
+        energies = records["stored_j"].sum() + records["dissipated_j"].sum() + stored + dissipated
+        work = float(records["work_j"].sum())
+        assert work == pytest.approx(energies, abs=1e-11)
+        assert min(work, stored, dissipated, records["stored_j"].min()) >= -1e-9
+        felt = max(felt, float(np.linalg.norm(forces, axis=1).max()))
+    assert loop.memory.counters["faults"][0] == 0
+    assert swaps
+    assert resets
+    assert felt > 0.05
+
+
+def test_no_energy_comes_out_of_the_loop_in_adversarial_ticks(
+    make_surface_model: Callable[..., SurfaceModel],
+) -> None:
+    check_adversarial_ticks(make_surface_model, 6_000, seed=3)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_no_energy_comes_out_of_the_loop_in_half_a_million_adversarial_ticks(
+    make_surface_model: Callable[..., SurfaceModel],
+) -> None:
+    for seed in range(10):
+        check_adversarial_ticks(make_surface_model, 50_000, seed)
+
+
 def test_a_tip_can_be_exchanged_while_it_touches_nothing(
     make_surface_model: Callable[..., SurfaceModel],
 ) -> None:
