@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.model_file import SurfaceModel
-from palpate_client.wire import Flags
+from palpate_client.wire import MAX_POSITION_M, Flags
 from palpate_server.coupling import sphere_contact, spheres
 from palpate_server.coupling.spheres import DEFAULT_STIFFNESS_N_PER_M
 from palpate_server.realtime import native_image
@@ -19,6 +19,8 @@ from palpate_server.realtime.records import REACTION
 
 Floats = NDArray[np.float64]
 Records = NDArray[np.void]
+
+_LEAST_STIFFNESS_N_PER_M, _MOST_STIFFNESS_N_PER_M = 1e-6, 1e12
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Simulation:
     model                a surface model
     stiffness_n_per_m    of the coupling spring between each tool's position and its sphere: of all tools, or by name
 
-    Raises ValueError for a stiffness that is not positive, and for modes above half the sampling rate.
+    Raises ValueError for a stiffness that is out of range, and for modes above half the sampling rate.
     """
 
     def __init__(
@@ -85,7 +87,7 @@ class Simulation:
         """Move the named tools to positions (3,), m, of their spheres' centers in the model frame, and advance one period.
 
         A tool that is not named touches nothing. Raises ValueError for an unknown tool or a position that is not three
-        finite numbers; then nothing has changed.
+        numbers up to 1000 m; then nothing has changed.
         """
         wanted = {self._tool(name): _position(name, values) for name, values in positions_m.items()}
         for i in range(len(self._index)):
@@ -136,8 +138,10 @@ class Simulation:
         else:
             values = [float(stiffness)] * len(self._index)
         for value in values:
-            if not (value > 0 and np.isfinite(value)):
-                raise ValueError(f"stiffness_n_per_m = {value:g}: expected a positive number")
+            if not _LEAST_STIFFNESS_N_PER_M <= value <= _MOST_STIFFNESS_N_PER_M:
+                raise ValueError(
+                    f"stiffness_n_per_m = {value:g}: expected {_LEAST_STIFFNESS_N_PER_M:g} to {_MOST_STIFFNESS_N_PER_M:g}"
+                )
         return values
 
     def _tool(self, name: str) -> int:
@@ -161,9 +165,15 @@ class Simulation:
 
 
 def _position(name: str, values: Iterable[float]) -> Floats:
-    position = np.asarray(values, float)
-    if position.shape != (3,) or not np.all(np.isfinite(position)):
-        raise ValueError(f"position of {name!r} is {values!r}: expected three finite numbers, in m")
+    given = values if isinstance(values, np.ndarray) else list(values)
+    try:
+        position = np.asarray(given, float)
+    except (TypeError, ValueError):
+        position = np.zeros(0)
+    if position.shape != (3,) or not np.all(np.abs(position) <= MAX_POSITION_M):
+        raise ValueError(
+            f"position of {name!r} is {given!r}: expected three finite numbers, in m, up to {MAX_POSITION_M:g}"
+        )
     return position
 
 

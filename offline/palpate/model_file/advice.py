@@ -26,7 +26,7 @@ def force_advice(model: ReducedModel | SurfaceModel) -> list[str]:
 
 def _of_surface(model: SurfaceModel) -> list[str]:
     accuracy, (low, high) = model.accuracy, model.band_hz
-    return [
+    found = [
         f"Force {where}: wrong by {percent(error)}; lower surface.tolerance."
         for error, where in (
             (accuracy.error_in_working_area, f"in {low:g}-{high:g} Hz in the working area"),
@@ -34,6 +34,10 @@ def _of_surface(model: SurfaceModel) -> list[str]:
         )
         if not error <= NOTABLE_ERROR  # NaN is notable
     ]
+    if not accuracy.is_passive:
+        margin = min(accuracy.passivity_margin, accuracy.passivity_margin_sampled)
+        found.append(f"Energy: it can be given out, passivity margin {margin:.2g}; build the model again.")
+    return found
 
 
 def _of_patches(model: ReducedModel) -> list[str]:

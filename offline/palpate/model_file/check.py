@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from palpate.files import printable
 from palpate.model_file.members import Header, arrays_of, check_shapes
-from palpate.model_file.surface_model import SurfaceAccuracy, SurfaceModel, ToolShape
+from palpate.model_file.surface_model import (
+    LEAST_RADIUS_M,
+    MOST_FRICTION,
+    MOST_RADIUS_M,
+    SurfaceAccuracy,
+    SurfaceModel,
+    ToolShape,
+)
 from palpate.model_file.types import (
     LONGEST_PERIOD_S,
     SHORTEST_PERIOD_S,
@@ -24,6 +31,11 @@ from palpate.model_file.types import (
 
 _LONGEST_NAME = 64
 _LONGEST_TEXT = 200
+_LARGEST_SINGLE, _LARGEST_DOUBLE = 1e15, 1e20
+"""Of the entries of arrays, in SI units: far beyond any body, and far enough from overflow for the sums of a tick."""
+
+_LEAST_OF_BRANCH = 1e-9
+"""Of a branch's gamma and tau_s: the scene's bounds."""
 
 
 def check_model(model: ReducedModel | SurfaceModel) -> None:
@@ -126,14 +138,17 @@ def _arrays(model: ReducedModel) -> None:
     channels = len(model.static_stiffness)
     if channels != model.n_inputs:
         raise refuse("static_stiffness", f"{channels} rows", f"{model.n_inputs}, three for each contact")
-    _finite(arrays)
+    _plausible(arrays)
     _triangles("surface_triangles", model.surface.triangles, len(model.surface.vertices))
 
 
-def _finite(arrays: dict[str, NDArray[Any]]) -> None:
+def _plausible(arrays: dict[str, NDArray[Any]]) -> None:
     for name, array in arrays.items():
         if not np.all(np.isfinite(array)):
             raise refuse(name, "not finite in some places", "finite numbers")
+        most = _LARGEST_SINGLE if array.dtype == np.float32 else _LARGEST_DOUBLE
+        if array.size and not (largest := float(np.abs(array).max())) <= most:
+            raise refuse(name, f"up to {largest:.3g}", f"numbers of at most {most:g}")
 
 
 def _triangles(field: str, triangles: NDArray[np.int32], n_vertices: int) -> None:
@@ -145,8 +160,8 @@ def _tools(tools: tuple[ToolShape, ...]) -> None:
     for index, tool in enumerate(tools):
         where = f"tools[{index}]"
         _text(f"{where}.name", tool.name, _LONGEST_NAME)
-        _number(f"{where}.radius_m", tool.radius_m, 1e-9, 1e3)
-        _number(f"{where}.friction", tool.friction, 0.0, 10.0)
+        _number(f"{where}.radius_m", tool.radius_m, LEAST_RADIUS_M, MOST_RADIUS_M)
+        _number(f"{where}.friction", tool.friction, 0.0, MOST_FRICTION)
         if len(tool.home_m) != 3:
             raise refuse(f"{where}.home_m", tool.home_m, "three numbers")
         for value in tool.home_m:
@@ -171,7 +186,7 @@ def _arrays_of_surface(model: SurfaceModel) -> None:
         raise refuse("residual", "not symmetric", "a symmetric matrix")
     arrays = arrays_of(model)
     check_shapes({name: Header(array.dtype.str, array.shape) for name, array in arrays.items()}, model.kind)
-    _finite(arrays)
+    _plausible(arrays)
     _triangles("triangles", model.triangles, model.n_points)
     lengths = np.linalg.norm(model.normals, axis=1)
     if not np.all(np.abs(lengths - 1) < 1e-6):
@@ -182,8 +197,8 @@ def _arrays_of_surface(model: SurfaceModel) -> None:
             "squared_frequencies", "not positive and ascending", "positive numbers in ascending order"
         )
     for name in ("gamma", "tau_s"):
-        if not np.all(getattr(model, name) > 0):
-            raise refuse(name, getattr(model, name).min(), "numbers above 0")
+        if not np.all(getattr(model, name) >= _LEAST_OF_BRANCH):
+            raise refuse(name, getattr(model, name).min(), f"numbers of at least {_LEAST_OF_BRANCH:g}")
     if np.any(model.shapes[model.held]) or np.any(model.residual[np.repeat(model.held, 3)]):
         raise refuse("held", "of points that move", "points whose shapes and residual are zero")
     if not np.all(model.residual.diagonal() >= 0):

@@ -10,6 +10,15 @@ from numpy.typing import NDArray
 
 from palpate.model_file.types import FORMAT, SCHEMA_VERSION, UNITS
 
+LEAST_RADIUS_M, MOST_RADIUS_M = 1e-4, 1.0
+MOST_FRICTION = 2.0
+
+SAMPLE_SIZE = 204
+"""Points at which the errors of a model are measured; all there are where that is fewer."""
+
+_ROUND_OFF = 1e-9
+"""Of a passivity margin: what double precision leaves near a resonance without damping."""
+
 Array = NDArray[np.float64]
 
 
@@ -17,7 +26,8 @@ Array = NDArray[np.float64]
 class ToolShape:
     """A rigid sphere that touches the surface.
 
-    friction  Coulomb's coefficient against the tissue
+    radius_m  LEAST_RADIUS_M to MOST_RADIUS_M
+    friction  Coulomb's coefficient against the tissue, 0 to MOST_FRICTION
     home_m    where its center starts, in the model frame, clear of the surface
     """
 
@@ -35,12 +45,13 @@ class SurfaceAccuracy:
     over the directions, of |force error| / |force|. Relative errors are fractions.
 
     contact_radius_m          radius of the contact, sqrt(radius * depth) (Hertz 1882)
-    error_static              largest at 0 Hz over a sample of some 200 points, against static solutions of their own
+    error_static              largest at 0 Hz over a sample of SAMPLE_SIZE points, against static solutions of their own
     error_static_median       the median over the sample
     error_in_band             largest in the band over the sample, against the assembled body; before sampling in time
     error_in_band_median      the median over the sample
     error_in_working_area     the largest over the sample's points in the working areas, where tools are meant to touch
-    error_map                 (n_points,) float32: the error of the nearest point of the sample, 0 at held points
+    error_map                 (n_points,) float32: the error of the nearest point of the sample; 1 where the points are too far
+                              apart to carry the smallest tool; 0 at held points
     passivity_margin          smallest eigenvalue, over the points and up to half the sampling rate, of the part of w C(jw) that
                               dissipates, over |w C(0)|; 0 or above to round-off, else no model is made
     passivity_margin_sampled  the same for the displacement in a tick under a force held over it, sampled for period_s
@@ -61,6 +72,11 @@ class SurfaceAccuracy:
     residual_shift_m_per_n: float
     resolved_frequency_hz: float
     error_map: NDArray[np.float32]
+
+    @property
+    def is_passive(self) -> bool:
+        """Whether no energy comes out: both margins are 0 or above, to round-off."""
+        return min(self.passivity_margin, self.passivity_margin_sampled) >= -_ROUND_OFF
 
     @staticmethod
     def unknown(n_points: int) -> SurfaceAccuracy:

@@ -13,6 +13,7 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator, mo
 
 from palpate.files import missing
 from palpate.model_file import LONGEST_PERIOD_S, SHORTEST_PERIOD_S
+from palpate.model_file.surface_model import LEAST_RADIUS_M, MOST_FRICTION, MOST_RADIUS_M
 from palpate.scene.inclusions import Inclusion, SurfaceInclusion
 from palpate.scene.material import Material, PronySeries, check_constant
 from palpate.scene.quantities import (
@@ -101,8 +102,8 @@ class ToolTable(Table):
     """A rigid sphere that touches the body anywhere on its surface."""
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,31}$")
-    radius_m: Length
-    friction: Number = Field(ge=0, le=2, description="Coulomb's coefficient against the tissue")
+    radius_m: Number = Field(ge=LEAST_RADIUS_M, le=MOST_RADIUS_M)
+    friction: Number = Field(ge=0, le=MOST_FRICTION, description="Coulomb's coefficient against the tissue")
     home_m: Point | None = Field(
         default=None, description="where its center starts, clear of the surface; unset: above a working area"
     )

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from palpate.model_file.surface_model import LEAST_RADIUS_M, MOST_FRICTION, MOST_RADIUS_M
 from palpate_client.messages import Frame, Vector
 from palpate_client.wire import (
     MAX_REQUEST_BYTES,
@@ -25,6 +26,9 @@ from palpate_server.session.devices import PROFILES, Device
 
 SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3
 FARTHEST_ORIGIN_M = 10.0
+LONGEST_ROUND_TRIP_S = 1.0
+MOST_DEVICE_DAMPING_N_S_PER_M = 1e3
+LEAST_STIFFNESS_N_PER_M, MOST_STIFFNESS_N_PER_M = 1.0, 1e5
 _ORTHONORMAL = 1e-6
 
 
@@ -116,8 +120,8 @@ def _vector(name: str, value: Any) -> Vector:
 
 def device_in(request: dict[str, Any]) -> Device | None:
     name = request.get("device")
-    round_trip_s = _optional_number(request, "round_trip_s")
-    damping = _optional_number(request, "device_damping_n_s_per_m")
+    round_trip_s = _optional_number(request, "round_trip_s", 0.0, LONGEST_ROUND_TRIP_S)
+    damping = _optional_number(request, "device_damping_n_s_per_m", 0.0, MOST_DEVICE_DAMPING_N_S_PER_M)
     if name is None:
         return None
     if not (isinstance(name, str) and name in PROFILES):
@@ -137,15 +141,11 @@ AS_IT_IS = TipWanted()
 
 
 def tip_in(request: dict[str, Any]) -> TipWanted:
-    wanted = TipWanted(
-        _optional_number(request, "radius_m"),
-        _optional_number(request, "friction"),
-        _optional_number(request, "stiffness_n_per_m"),
+    return TipWanted(
+        _optional_number(request, "radius_m", LEAST_RADIUS_M, MOST_RADIUS_M),
+        _optional_number(request, "friction", 0.0, MOST_FRICTION),
+        _optional_number(request, "stiffness_n_per_m", LEAST_STIFFNESS_N_PER_M, MOST_STIFFNESS_N_PER_M),
     )
-    for field in ("radius_m", "stiffness_n_per_m"):
-        if getattr(wanted, field) == 0:
-            raise Refused("out_of_range", f"{field} is 0: expected a number above 0")
-    return wanted
 
 
 def limits_in(request: dict[str, Any], known: tuple[str, ...]) -> dict[str, float]:
@@ -167,13 +167,13 @@ def number(field: str, value: object) -> float:
     return float(value)
 
 
-def _optional_number(request: dict[str, Any], field: str) -> float | None:
+def _optional_number(request: dict[str, Any], field: str, least: float, most: float) -> float | None:
     given = request.get(field)
     if given is None:
         return None
     value = number(field, given)
-    if value < 0:
-        raise Refused("out_of_range", f"{field} is {value:g}: expected at least 0")
+    if not least <= value <= most:
+        raise Refused("out_of_range", f"{field} is {value:g}: expected {least:g} to {most:g}")
     return value
 
 

@@ -44,9 +44,10 @@ class ModelLoader:
             state.check_alone(client)
             model = self._read(file)
             tips = self._tips(model)
-            memory = self._fade_to(model, tips)
+            memory = self._fade_to(model, list(tips.values()))
             with state.model_in_use:
                 self._end_exchange(memory, model)
+                state.tips = tips
             log.info("now serving %s (order %d)", model.name, model.order)
             for warning in accuracy_warnings(model):
                 log.warning("%s", warning)
@@ -79,7 +80,7 @@ class ModelLoader:
                 raise Refused("stopping", "the server is stopping")
         return memory
 
-    def _tips(self, model: Model) -> tuple[Tip, ...]:
+    def _tips(self, model: Model) -> dict[str, Tip]:
         """The tips that the tools are to have on another model, as their holders asked for them. Raises Refused."""
         try:
             return tips_for(model, self._state.leases.settings)
@@ -134,8 +135,8 @@ def warnings_of(state: SessionState, tools: Iterable[str]) -> list[str]:
     warnings: list[str] = []
     for name in tools:
         settings = state.leases.settings[name]
-        warnings += tip_warnings(state.model, name, settings.wanted)
+        index = state.tool_index[name]
+        warnings += tip_warnings(state.model, index, state.tips.get(name))
         if settings.device is not None and isinstance(state.model, ReducedModel):  # others are soft enough
-            index = state.tool_index[name]
             warnings += warnings_for(settings.device, state.model, index, settings.frame.scale)
     return list(dict.fromkeys(warnings))  # tools are often alike

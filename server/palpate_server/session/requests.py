@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from palpate_client.messages import Vector
 from palpate_server.coupling import models
 from palpate_server.coupling.running import Tip
 from palpate_server.errors import Refused
@@ -97,12 +98,13 @@ class Requests:
         if not state.exchanging.acquire(blocking=False):
             raise Refused("busy", "another model is being loaded")
         try:
-            described = {tool.name: tool for tool in models.tools_of(state.model)}
-            tips = {name: tip_for(state.model, name, wanted, device, frame.scale) for name in tools}
+            tips = {
+                name: tip_for(state.model, state.tool_index[name], wanted, device, frame.scale)
+                for name in tools
+            }
             self._silence(tools)
             for name, tip in tips.items():
-                start = described[name].start_m if tip is None else tip.start_m
-                home = frame.point_at_client(start)
+                home = frame.point_at_client(self._start_m(name, tip))
                 self._set_up(name, ToolSettings(limits, frame, home, device, wanted), tip)
             leases.holders |= dict.fromkeys(tools, client)
         finally:
@@ -112,13 +114,18 @@ class Requests:
                 name: {
                     "limits": limits._asdict(),
                     "home_m": leases.settings[name].home_m,
-                    **tip_message(state.model, name, leases.settings[name]),
+                    **tip_message(tips[name], frame.scale),
                 }
                 for name in tools
             },
             "frame": asdict(frame),
             "warnings": warnings_of(state, tools),
         }
+
+    def _start_m(self, name: str, tip: Tip | None) -> Vector:
+        if tip is not None:
+            return tip.start_m
+        return models.tools_of(self._state.model)[self._state.tool_index[name]].start_m
 
     def _check_alive(self, client: str) -> None:
         # The token may be so new that on_client was not called yet.
@@ -158,6 +165,7 @@ class Requests:
         settings[name] = wanted
         if tip is not None:
             state.between_ticks(scheduler.set_tip, tool, np.array(tip[:3]), np.array(tip.start_m))
+            state.tips[name] = tip
 
     def _set_limits(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
         state, settings = self._state, self._state.leases.settings
@@ -203,6 +211,6 @@ class Requests:
         leases = self._state.leases
         released = leases.release(client)
         self._state.forget_commands(released)
-        for name in released:  # limits and frame stay in use until the next acquire
+        for name in released:  # limits, frame and tip stay in use until the next acquire
             leases.settings[name] = replace(leases.settings[name], device=None, wanted=fields.AS_IT_IS)
         return released

@@ -44,6 +44,7 @@ class SessionState:
     memory, image  of the loop
     lease_numbers  number of the present hold of each tool, as in the loop's memory
     leases         holders and settings of the tools
+    tips           of the tools, as the loop has them: agreed with the present or last holder; none for a patch model
     messages       counters of commands
     running        False once the server stops: commands and requests are then refused
     stopping       set when all threads have to end
@@ -63,7 +64,8 @@ class SessionState:
         self.tool_index = {name: i for i, name in enumerate(self.tools)}
         homes = [tool.start_m for tool in tools]
         self.leases = Leases({tool.name: ToolSettings(limits, Frame(), tool.start_m) for tool in tools})
-        running = models.make_running(model, tips_for(model, self.leases.settings))
+        self.tips = tips_for(model, self.leases.settings)
+        running = models.make_running(model, list(self.tips.values()))
         self.memory = shared_memory.make_memory(
             running, model.period_s, [limits] * len(tools), surface_period_s, homes
         )

@@ -107,7 +107,7 @@ def _tool_status(state: SessionState, name: str) -> dict[str, Any]:
         "limits": settings.limits._asdict(),
         "frame": asdict(settings.frame),
         "home_m": settings.home_m,
-        **tip_message(state.model, name, settings),
+        **tip_message(state.tips.get(name), settings.frame.scale),
     }
 
 

@@ -131,8 +131,10 @@ def entry(name: str, place: Any, value: float) -> Callable[[Any, Any], None]:
     [
         (meta("tools", []), "'tools' is .*at least one tool"),
         (meta("tools", 3), "'tools' is 3: expected a list"),
-        (tool("radius_m", 0.0), r"'tools\[0\].radius_m' is 0.0: expected a finite number at least 1e-09"),
+        (tool("radius_m", 0.0), r"'tools\[0\].radius_m' is 0.0: expected a finite number at least 0.0001 and at most 1"),
+        (tool("radius_m", 1e-200), r"'tools\[0\].radius_m' is 1e-200"),
         (tool("friction", -0.1), r"'tools\[0\].friction' is -0.1"),
+        (tool("friction", 2.5), r"'tools\[0\].friction' is 2.5: expected a finite number at least 0 and at most 2"),
         (tool("home_m", [0.0, 1.0]), r"'tools\[0\].home_m' is \(0.0, 1.0\): expected three numbers"),
         (tool("name", "other"), "'tools' is .*each name once"),
         (tool("mass_kg", 1.0), r"'tools\[0\].mass_kg' is unknown"),
@@ -152,10 +154,14 @@ def entry(name: str, place: Any, value: float) -> Callable[[Any, Any], None]:
         (array("triangles", np.array([[0, 1, 4]], np.int32)), "'triangles' is 4: expected indices of vertices, 0 to 3"),
         (array("squared_frequencies", np.array([90.0, 40.0])), "'squared_frequencies' is not positive and ascending"),
         (array("squared_frequencies", np.array([0.0, 40.0])), "'squared_frequencies' is not positive and ascending"),
-        (array("gamma", np.array([-0.5])), "'gamma' is -0.5: expected numbers above 0"),
+        (array("gamma", np.array([-0.5])), "'gamma' is -0.5: expected numbers of at least 1e-09"),
+        (array("tau_s", np.array([1e-310])), "'tau_s' is 1e-310: expected numbers of at least 1e-09"),
         (array("tau_s", np.array([0.1, 0.2])), r"'tau_s' is <f8 \(2,\)"),
         (entry("residual", 0, -1.0), "'residual' is negative on its diagonal"),
         (entry("residual", 3, np.nan), "'residual' is not finite"),
+        (entry("residual", 2, 1e30), "'residual' is up to 1e\\+30: expected numbers of at most 1e\\+15"),
+        (entry("shapes", (0, 0, 0), 1e30), "'shapes' is up to 1e\\+30"),
+        (entry("points", (0, 0), 1e300), "'points' is up to 1e\\+300: expected numbers of at most 1e\\+20"),
     ],
 )  # fmt: skip
 def test_an_inconsistent_file_is_refused_in_one_line_that_names_the_field(
