@@ -108,7 +108,7 @@ class Connection:
 
     @property
     def description(self) -> Description:
-        """The server's answer to `describe` at the last agreement."""
+        """The server's newest answer to `describe`."""
         if self._description is None:
             raise RuntimeError("the connection is not open: use it in a `with` statement")
         return self._description
@@ -169,6 +169,21 @@ class Connection:
             return wire.unpack(payload, wire.Kind.ANSWER)
         except wire.MalformedMessage as error:
             raise Incompatible(f"the server's answer can't be read: {error}") from error
+
+    def describe(self) -> Description:
+        """Ask for the description again, since another model may have been loaded, and keep it. Raises what `ask` raises."""
+        message = wire.unpack_map(self.ask(self.keys.describe), wire.MAX_MESSAGE_BYTES)
+        version = message.get("schema_version")
+        if version != wire.SCHEMA_VERSION:
+            raise Incompatible(
+                f"the server speaks schema version {version}, this client {wire.SCHEMA_VERSION}: "
+                "install the same version of palpate on both sides"
+            )
+        try:
+            self._description = read_description(message)
+        except (KeyError, TypeError) as error:
+            raise Incompatible(f"the server's description can't be read: {error!r}") from error
+        return self._description
 
     def geometry(self) -> Geometry:
         """The surface at rest of the model that runs. Raises what `ask` raises."""
@@ -300,22 +315,12 @@ class Connection:
         give_up_s = time.monotonic() + QUERY_TIMEOUT_S
         while True:  # through a router the token may arrive before queries do
             try:
-                message = wire.unpack_map(self.ask(self.keys.describe), wire.MAX_MESSAGE_BYTES)
-                break
+                self.describe()
+                return
             except ServerGone:
                 if time.monotonic() > give_up_s:
                     raise
                 time.sleep(RETRY_PAUSE_S)
-        version = message.get("schema_version")
-        if version != wire.SCHEMA_VERSION:
-            raise Incompatible(
-                f"the server speaks schema version {version}, this client {wire.SCHEMA_VERSION}: "
-                "install the same version of palpate on both sides"
-            )
-        try:
-            self._description = read_description(message)
-        except (KeyError, TypeError) as error:
-            raise Incompatible(f"the server's description can't be read: {error!r}") from error
 
 
 def open_session(endpoint: str, zenoh_config: str | Path | None = None) -> zenoh.Session:

@@ -10,7 +10,7 @@ from typing import Any
 from palpate_client.connection import Connection, Subscription, steps
 from palpate_client.contract import Contract
 from palpate_client.errors import ServerGone, ToolLost
-from palpate_client.messages import Force, Frame, Vector
+from palpate_client.messages import Description, Force, Frame, Vector
 
 NO_FORCE: Vector = (0.0, 0.0, 0.0)
 SETTLE_S = 0.5  # until the server's deadlines follow our commands; a quarter of a second is enough
@@ -30,6 +30,7 @@ class Tool:
     frame: how the client's axes and unit relate to the model's.
     silence_s: `move` gives up when no force has come for this long.
     radius_m, friction: of the sphere, for a surface model; without them, the model file's. See "Tips" in docs/wire.md.
+    stiffness_n_per_m: of the spring between device and sphere, for a surface model; without it, the most that the device renders.
 
     Attributes
     ----------
@@ -39,6 +40,9 @@ class Tool:
     warnings: the server's warnings, to be shown to the user.
     touches_anywhere: whether the model is one whose surface can be touched everywhere, from outside.
     contract: checks every force, and counts.
+
+    `home_m`, `normal` and `touches_anywhere` are of the model that runs when the tool is acquired: while it is held, no other
+    client can load another.
     """
 
     def __init__(
@@ -50,21 +54,20 @@ class Tool:
         silence_s: float = 1.0,
         radius_m: float | None = None,
         friction: float | None = None,
+        stiffness_n_per_m: float | None = None,
     ) -> None:
         tools = connection.description.tools
         self.name = tools[0].name if name is None else name
-        described = tools[connection.description.index(self.name)]
         self.frame = frame or Frame()
-        self.normal = self.frame.direction_at_client(described.normal)
-        self.home_m: Vector = described.start_m
-        self.touches_anywhere = connection.description.message["model"].get("kind") == "surface"
+        self.home_m: Vector = tools[connection.description.index(self.name)].start_m
+        self._read_description(connection.description)
         self.limits: dict[str, float] = {}
         self.warnings: list[str] = []
         self.contract = Contract(connection.description)
         self.newest: Force | None = None  # the newest force that keeps the contract
         self._connection = connection
         self._silence_s = silence_s
-        self._tip = {"radius_m": radius_m, "friction": friction}
+        self._tip = {"radius_m": radius_m, "friction": friction, "stiffness_n_per_m": stiffness_n_per_m}
         self._since_s = time.monotonic()
         self._rendered_tick: int | None = None
         self._attached = False
@@ -178,6 +181,7 @@ class Tool:
         answer = self._connection.control(
             "acquire", tools=[self.name], frame=self.frame.message(), **self._tip, **device
         )
+        self._read_description(self._connection.describe())
         agreed = answer["tools"][self.name]
         self.limits = agreed["limits"]
         x, y, z = agreed["home_m"]
@@ -188,6 +192,11 @@ class Tool:
         self._since_s = time.monotonic()
         self._rendered_tick = None
         self.contract.acquired(self.limits["max_force_n"])
+
+    def _read_description(self, description: Description) -> None:
+        described = description.tools[description.index(self.name)]
+        self.normal = self.frame.direction_at_client(described.normal)
+        self.touches_anywhere = description.message["model"].get("kind") == "surface"
 
     def _on_force(self, force: Force) -> None:
         if self.contract.on_force(force):  # a force that breaks the contract is as good as none
