@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ PICTURES = {
 }
 """The picture of each function's call on the page."""
 
+TOUR_PICTURES = ("press.png",)
+
 
 def main() -> None:
     blocks = re.findall(
@@ -31,6 +34,11 @@ def main() -> None:
     )
     for name, figure in figures("\n".join(blocks[:-1])).items():  # the last needs a model that takes minutes
         figure.savefig(DOCS / "images" / f"{PICTURES[name]}.png", dpi=110)
+    tour = (DOCS / "tour.md").read_text()
+    for program in re.findall(r"<<'PROGRAM'\n(.*?)^PROGRAM$", tour, re.MULTILINE | re.DOTALL):
+        exec(compile(program, "tour.md", "exec"), {})
+    for name in TOUR_PICTURES:  # which the programs leave in the current folder
+        shutil.move(name, DOCS / "images" / f"tour_{name}")
 
 
 def figures(code: str) -> dict[str, Figure]:

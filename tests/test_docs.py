@@ -90,7 +90,9 @@ def commands(page: Path) -> Iterator[list[str]]:
     """The arguments of each `palpate` in the page's shell blocks, without what the shell takes for itself."""
     for text in COMMAND.findall("\n".join(SHELL.findall(page.read_text()))):
         words = shlex.split(text, comments=True)
-        end = next((i for i, word in enumerate(words) if word[0] in ">&|" or word.endswith(";")), None)
+        end = next(
+            (i for i, word in enumerate(words) if re.match(r"\d?[>&|]", word) or word.endswith(";")), None
+        )
         yield [
             word.rstrip(";") for word in (words if end is None else words[: end + words[end].endswith(";")])
         ]
