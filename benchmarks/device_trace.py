@@ -90,6 +90,6 @@ def trace_of(sent_ns: Sequence[int], heard: Sequence[ReceivedForce]) -> Trace:
 
 def trace_through_a_model(path: Path, tool: str, seconds: float) -> tuple[RoundTrips, Trace]:
     """The round trips with a server of its own for the model in `path`, and all that a device would have lived through."""
-    sent, forces, _ = driven(path, tool, seconds, viewer=False)
+    sent, forces, _ = driven(path, [tool], seconds, viewer=False)
     settled = int(SETTLE_S * RATE_HZ)
     return answered(sent, forces), trace_of(sent, forces).piece(settled, len(sent) - settled)

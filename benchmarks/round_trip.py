@@ -46,7 +46,7 @@ def main() -> None:
                 codec.as_words(np.zeros(1, TICK))[0], codec.as_words(np.zeros(n, PORT_RECORD))
             )
         )
-        command_bytes = len(encode_command(tool, 10**6, 10**15, (0.1, 0.2, 0.3)))
+        command_bytes = len(encode_command(10**6, 10**15, {tool: (0.1, 0.2, 0.3)}))
         print(
             f"order {model.order}, {n} tools; "
             f"command {command_bytes} bytes, force {force_bytes} bytes, {RATE_HZ} Hz"
@@ -54,7 +54,7 @@ def main() -> None:
         bare, palpate = [], []
         for run in range(options.runs):
             bare.append(ping_pong(command_bytes, force_bytes, options.seconds))
-            palpate.append(through_a_model(path, tool, options.seconds, viewer=False)[0])
+            palpate.append(through_a_model(path, [tool], options.seconds, viewer=False)[0])
             print(f"run {run}: ping/pong {describe(bare[-1])}; palpate {describe(palpate[-1])}", flush=True)
         for name in ("p50_s", "p99_s"):
             b, p = (statistics.median(getattr(r, name) for r in results) for results in (bare, palpate))

@@ -73,7 +73,7 @@ def measure(
     output = folder / "cyclictest.txt"  # more text than a pipe holds
     bare = cyclictest(seconds, fifo, output)
     try:
-        _, status = through_a_model(path, contact, seconds, viewer=True)
+        _, status = through_a_model(path, [contact], seconds, viewer=True)
     finally:
         bare.wait()
     return status, read_histogram(output.read_text())

@@ -103,8 +103,8 @@ def unread(_: Any) -> int:
 def poor_host(case: Any) -> int:
     finding = check_host.Finding("timer lateness", "", {}, check_host.NOT_SUFFICIENT)
     case.patch.setattr(check_host, "transport_round_trip", lambda: [finding])
-    case.patch.setattr(check_host, "tick_run", lambda seconds: [])
-    case.patch.setattr(check_host, "under_load", lambda: finding)
+    case.patch.setattr(check_host, "tick_run", lambda path, seconds: [])
+    case.patch.setattr(check_host, "under_load", lambda path: finding)
     return int(case.run("check-host")[0])
 
 
@@ -209,8 +209,8 @@ def test_the_json_of_each_command_has_the_fields_of_the_page(
     assert set(json.loads(replayed(case, SAME, "--json")[1])) == fields("replay")
     finding = check_host.Finding("ping", "", {}, check_host.GOOD)
     case.patch.setattr(check_host, "transport_round_trip", lambda: [finding])
-    case.patch.setattr(check_host, "tick_run", lambda seconds: [])
-    case.patch.setattr(check_host, "under_load", lambda: finding)
+    case.patch.setattr(check_host, "tick_run", lambda path, seconds: [])
+    case.patch.setattr(check_host, "under_load", lambda path: finding)
     assert set(json.loads(case.run("check-host", "--json")[1])) == fields("check-host")
 
 

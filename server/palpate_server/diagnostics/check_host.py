@@ -1,6 +1,8 @@
 """Measure whether this machine can run a server at 1 kHz: a verdict, and what to change.
 
-    palpate check-host [--seconds 10] [--json]
+    palpate check-host [MODEL.npz] [--seconds 10] [--json]
+
+With a model, the server runs this one, and all of its tools are pressed; without, a small sample of one patch.
 
 Exit code 0: good or marginal. 1: not sufficient. 2: it could not be measured. 130: Ctrl-C.
 """
@@ -25,12 +27,13 @@ from pathlib import Path
 import zenoh
 
 import palpate_server.session.server  # noqa: F401, it runs in a child process; a missing package is found here, at the start
-from palpate.model_file import save_model
+from palpate.model_file import ModelFileError, load_model, save_model
 from palpate_client.arguments import failed, positive_up_to
 from palpate_client.connection import open_session
 from palpate_client.errors import ClientError
 from palpate_client.local_server import free_endpoint, running
 from palpate_client.wire import LEASE_MS, Keys
+from palpate_server.coupling.models import tools_of
 from palpate_server.diagnostics.round_trips import RoundTrips, ping_pong, through_a_model
 from palpate_server.diagnostics.sample_model import spring_mass_model
 from palpate_server.realtime import threads
@@ -72,6 +75,7 @@ class Bounds:
 TIMER_LATENESS_P99_S = Bounds(100e-6, 500e-6)
 ROUND_TRIP_P99_S = Bounds(1e-3, 3e-3)
 UNANSWERED_SHARE = Bounds(0.01, 0.1)  # of commands: lost, or superseded before a tick used them
+COMPUTE_P99_PERIODS = 0.5, 0.9  # of a tick, good and marginal; the rest of the period is for messages
 LATE_SHARE = Bounds(0.001, 0.01)
 SKIPPED_SHARE = Bounds(0.0, 0.001)
 LOAD_PER_CPU = 0.3
@@ -135,13 +139,12 @@ def transport_round_trip(seconds: float = _PING_PONG_S) -> list[Finding]:
     return [_round_trip("Zenoh round trip", trips, advice), _unanswered("unanswered pings", trips, advice)]
 
 
-def tick_run(seconds: float) -> list[Finding]:
-    """A server with a sample model, a client at 1 kHz and a viewer of the surface."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "sample.npz"
-        save_model(spring_mass_model(n_modes=50), path)
-        trips, status = through_a_model(path, "tip", seconds, viewer=True)
-    timer = status["timer_lateness_s"]
+def tick_run(path: Path, seconds: float) -> list[Finding]:
+    """A server with a model, a client that presses all tools at 1 kHz, and a viewer of the surface. Raises ModelFileError, ClientError."""
+    model = load_model(path)
+    tools = [tool.name for tool in tools_of(model)]
+    trips, status = through_a_model(path, tools, seconds, viewer=True)
+    timer, compute = status["timer_lateness_s"], status["compute_time_s"]
     late = status["late_ticks"] / max(status["ticks"], 1)
     skipped = status["skipped_ticks"] / max(status["ticks"], 1)
     return [
@@ -152,6 +155,13 @@ def tick_run(seconds: float) -> list[Finding]:
             TIMER_LATENESS_P99_S,
             "allow real-time priority, use a real-time kernel, stop other programs",
         ),
+        _duration(
+            "tick computation",
+            compute["p50"],
+            compute["p99"],
+            Bounds(*(share * model.period_s for share in COMPUTE_P99_PERIODS)),
+            "a model with fewer points, modes or tools, or a faster processor",
+        ),
         _round_trip("command to force", trips, "see timer and round trip"),
         _unanswered("unanswered commands", trips, "see timer and round trip"),
         _share("late ticks", late, LATE_SHARE, "allow real-time priority"),
@@ -159,7 +169,7 @@ def tick_run(seconds: float) -> list[Finding]:
     ]
 
 
-def under_load(seconds: float = _LOAD_S) -> Finding:
+def under_load(path: Path, seconds: float = _LOAD_S) -> Finding:
     """Whether a client keeps its link to a server beside one busy loop for each processor, each in a process session of its own.
 
     The longest silence is the longest time between two forces at the client. It includes the client's own wait for a processor.
@@ -172,21 +182,15 @@ def under_load(seconds: float = _LOAD_S) -> Finding:
             lost.set()
 
     endpoint, keys = free_endpoint(), Keys("check-host")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "sample.npz"
-        save_model(spring_mass_model(n_modes=50), path)
-        command = ["-m", "palpate_server", str(path), "--listen", endpoint, "--session", keys.session]
-        with (
-            running([sys.executable, *command], "serving"),
-            open_session(endpoint) as session,
-        ):
-            session.liveliness().declare_subscriber(keys.server, on_token, history=True)
-            session.declare_subscriber(keys.force, lambda sample: arrivals.append(time.monotonic()))
-            time.sleep(0.5)
-            arrivals[:] = arrivals[-1:]
-            with busy_loops(len(os.sched_getaffinity(0)), seconds):
-                time.sleep(seconds)
-            arrivals.append(time.monotonic())
+    command = ["-m", "palpate_server", str(path), "--listen", endpoint, "--session", keys.session]
+    with running([sys.executable, *command], "serving"), open_session(endpoint) as session:
+        session.liveliness().declare_subscriber(keys.server, on_token, history=True)
+        session.declare_subscriber(keys.force, lambda sample: arrivals.append(time.monotonic()))
+        time.sleep(0.5)
+        arrivals[:] = arrivals[-1:]
+        with busy_loops(len(os.sched_getaffinity(0)), seconds):
+            time.sleep(seconds)
+        arrivals.append(time.monotonic())
     silence_s = max(later - earlier for earlier, later in pairwise(arrivals))
     lease_s = LEASE_MS * 1e-3
     return Finding(
@@ -234,8 +238,28 @@ def _share(name: str, share: float, bounds: Bounds, advice: str) -> Finding:
     return Finding(name, f"{share:.3%}", {"share": share}, bounds.judge(share), advice)
 
 
+@contextlib.contextmanager
+def _model(path: Path | None) -> Iterator[Path]:
+    """A file that holds a model: the one at `path`, which is looked at first, or a sample. Raises ModelFileError, OSError."""
+    if path is not None:
+        load_model(path)
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        sample = Path(folder) / "sample.npz"
+        save_model(spring_mass_model(n_modes=50), sample)
+        yield sample
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="palpate check-host", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument(
+        "model",
+        type=Path,
+        nargs="?",
+        metavar="MODEL.npz",
+        help="the model that is to run here (default: a small sample)",
+    )
     parser.add_argument(
         "--seconds",
         type=positive_up_to(_LONGEST_S),
@@ -246,8 +270,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     hints = settings()
     try:
-        measured = [*transport_round_trip(), *tick_run(options.seconds), under_load()]
-    except ClientError as error:
+        with _model(options.model) as path:
+            measured = [*transport_round_trip(), *tick_run(path, options.seconds), under_load(path)]
+    except (ClientError, ModelFileError, OSError) as error:
         return failed("palpate check-host", error, 2)
     except KeyboardInterrupt:
         return 130

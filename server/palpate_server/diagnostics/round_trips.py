@@ -6,7 +6,7 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from palpate_server.session import transport
 
 RATE_HZ = 1000
 SETTLE_S = 1.0  # the server's deadlines need a quarter of a second to settle behind the commands
-_STEP_M = (0.001, 0.002, -0.003)  # of the commanded position from home_m
+_DEPTH_M = 0.003  # of the commanded positions
 
 
 @dataclass(frozen=True)
@@ -71,26 +71,27 @@ def pong(endpoint: str, size: int) -> None:
 
 
 def through_a_model(
-    path: Path, tool: str, seconds: float, *, viewer: bool
+    path: Path, tools: Sequence[str], seconds: float, *, viewer: bool
 ) -> tuple[RoundTrips, dict[str, Any]]:
-    """Round trips of commands for one tool to a new server with the model in `path`; and the server's last status.
+    """Round trips of commands that press some tools, to a new server with the model in `path`; and the server's last status.
 
     With `viewer`, this process also receives the surface, 60 times a second.
     """
-    sent, forces, status = driven(path, tool, seconds, viewer=viewer)
+    sent, forces, status = driven(path, tools, seconds, viewer=viewer)
     return answered(sent, forces), status
 
 
 def driven(
-    path: Path, tool: str, seconds: float, *, viewer: bool
+    path: Path, tools: Sequence[str], seconds: float, *, viewer: bool
 ) -> tuple[list[int], list[ReceivedForce], dict[str, Any]]:
-    """As `through_a_model`, unprocessed: when each command was sent, ns; every force of the tool; the last status."""
+    """As `through_a_model`, unprocessed: when each command was sent, ns; every force of the first tool; the last status."""
     endpoint = free_endpoint()
     command = [sys.executable, "-m", "palpate_server", str(path), "--listen", endpoint, "--surface-hz", "60"]
     forces: list[ReceivedForce] = []
     statuses: list[dict[str, Any]] = []
     with running(command, "serving"), Connection(endpoint) as connection:
-        index = connection.description.index(tool)
+        described = connection.description
+        index = described.index(tools[0])
         connection.on_status(statuses.append)
         if viewer:
             connection.on_surface(lambda surface: None)
@@ -103,12 +104,17 @@ def driven(
                     ReceivedForce(arrival_ns, force["tick"], force["server_time_ns"], sequence, age_ns)
                 )
 
-        acquired = connection.control("acquire", tools=[tool])["tools"][tool]
-        position_m = [home + step for home, step in zip(acquired["home_m"], _STEP_M, strict=True)]
+        acquired = connection.control("acquire", tools=list(tools))["tools"]
+        position_m = {}
+        for tool in tools:
+            normal = described.tools[described.index(tool)].normal
+            position_m[tool] = [
+                home - _DEPTH_M * n for home, n in zip(acquired[tool]["home_m"], normal, strict=True)
+            ]
         sent = _drive(
             connection.zenoh,
             (connection.keys.command(connection.name), connection.keys.force),
-            lambda sequence, now: encode_command(tool, sequence, now, position_m),
+            lambda sequence, now: encode_command(sequence, now, position_m),
             receive,
             seconds,
         )
@@ -120,13 +126,13 @@ def answered(sent: Sequence[int], forces: Sequence[ReceivedForce]) -> RoundTrips
     return _match(sent, [(force.sequence, force.arrival_ns) for force in forces])
 
 
-def encode_command(tool: str, sequence: int, now_ns: int, position_m: Sequence[float]) -> bytes:
+def encode_command(sequence: int, now_ns: int, position_m: Mapping[str, Sequence[float]]) -> bytes:
     return pack(
         {
             "kind": Kind.COMMAND,
             "sequence": sequence,
             "client_time_ns": now_ns,
-            "position_m": {tool: list(position_m)},
+            "position_m": position_m,
         }
     )
 

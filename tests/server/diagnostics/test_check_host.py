@@ -7,13 +7,16 @@ import json
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
 
+from palpate.model_file import SurfaceModel, save_model
+from palpate_client import Connection
 from palpate_client.wire import Keys
 from palpate_server.diagnostics import check_host
 from palpate_server.diagnostics.check_host import GOOD, MARGINAL, NOT_SUFFICIENT, Bounds, Finding
@@ -57,17 +60,23 @@ def test_messages_that_get_no_answer_count_however_fast_the_others_are(
 
 
 def test_a_check_ends_with_a_verdict_and_says_what_it_measured(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    make_surface_model: Callable[..., SurfaceModel],
 ) -> None:
+    """Of a surface model with two tools."""
+    save_model(make_surface_model(2), tmp_path / "model.npz")
     for name in ("transport_round_trip", "under_load"):
-        monkeypatch.setattr(check_host, name, partial(getattr(check_host, name), 1.0))
-    code = check_host.main(["--seconds", "1", "--json"])
+        monkeypatch.setattr(check_host, name, partial(getattr(check_host, name), seconds=1.0))
+    code = check_host.main([str(tmp_path / "model.npz"), "--seconds", "1", "--json"])
     report = json.loads(capsys.readouterr().out)
     findings = {finding["name"]: finding for finding in report["findings"]}
     measured = {
         "timer lateness": {"p50_s", "p99_s"},
         "Zenoh round trip": {"p50_s", "p99_s"},
         "unanswered pings": {"share"},
+        "tick computation": {"p50_s", "p99_s"},
         "command to force": {"p50_s", "p99_s"},
         "unanswered commands": {"share"},
         "late ticks": {"share"},
@@ -94,12 +103,14 @@ def test_the_exit_code_says_whether_the_machine_is_sufficient(
 ) -> None:
     finding = Finding("share", "", {}, check_host.UNANSWERED_SHARE.judge(worst_share))
     monkeypatch.setattr(check_host, "transport_round_trip", lambda: [finding])
-    monkeypatch.setattr(check_host, "tick_run", lambda seconds: [finding])
-    monkeypatch.setattr(check_host, "under_load", lambda: finding)
+    monkeypatch.setattr(check_host, "tick_run", lambda path, seconds: [finding])
+    monkeypatch.setattr(check_host, "under_load", lambda path: finding)
     assert check_host.main([]) == code
 
 
-def test_a_link_that_is_lost_under_load_is_not_sufficient(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_link_that_is_lost_under_load_is_not_sufficient(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     servers: list[zenoh.Session] = []
 
     @contextlib.contextmanager
@@ -117,9 +128,34 @@ def test_a_link_that_is_lost_under_load_is_not_sufficient(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(check_host, "running", a_token_without_a_server)
     monkeypatch.setattr(check_host, "busy_loops", load_that_ends_the_server)
-    finding = check_host.under_load(1.0)
+    finding = check_host.under_load(tmp_path / "model.npz", 1.0)
     assert finding.values["lost"] is True
     assert finding.verdict == NOT_SUFFICIENT
+
+
+def test_all_tools_press_while_ticks_are_measured(
+    tmp_path: Path, make_surface_model: Callable[..., SurfaceModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_model(make_surface_model(2), tmp_path / "model.npz")
+    seen: list[dict[str, Any]] = []
+    original = Connection.on_status
+
+    def on_status(self: Connection, receive: Callable[[dict[str, Any]], None]) -> object:
+        self.on_force(lambda message, arrival_ns: seen.append(message))
+        return original(self, receive)
+
+    monkeypatch.setattr(Connection, "on_status", on_status)
+    check_host.tick_run(tmp_path / "model.npz", 1.0)
+    assert any(min(message["n_contact_points"]) > 2 for message in seen)
+
+
+def test_what_is_no_model_is_refused_before_anything_is_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert check_host.main([str(tmp_path / "missing.npz")]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "missing.npz: no such model file" in err
 
 
 def test_busy_loops_run_in_sessions_of_their_own_and_end_with_the_block() -> None:
