@@ -26,6 +26,8 @@ from palpate_client.messages import Description
 from palpate_client.tool import Tool
 from palpate_client.trajectory import Trajectory, read_trajectory
 
+Row = tuple[float, ...]
+
 STATUS_WAIT_S = 1.0  # statuses come ten times a second
 
 
@@ -49,9 +51,9 @@ def run(connection: Connection, options: argparse.Namespace, trajectory: Traject
 
         check_output(Path(options.record))  # better to fail now than after the poke
     tool = Tool(connection, options.tool, silence_s=options.silence_s)
-    messages: list[dict[str, Any]] = []
+    rows: list[Row] = []
     if options.record is not None:
-        connection.on_force(lambda message, arrival_ns: messages.append(message))
+        connection.on_force(lambda message, arrival_ns: rows.append(row_of(message)))
     interrupted = False
     lost: str | None = None
     held = contextlib.ExitStack()
@@ -84,7 +86,7 @@ def run(connection: Connection, options: argparse.Namespace, trajectory: Traject
         print(f"contract broken: {line}", file=sys.stderr)
     if lost:
         print(f"palpate client: {lost}", file=sys.stderr)
-    unwritten = options.record is not None and not wrote(options.record, connection.description, messages)
+    unwritten = options.record is not None and not wrote(options.record, connection.description, rows)
     if interrupted:
         return 130
     if lost or summary["contract_broken"]:
@@ -131,7 +133,19 @@ def not_carried_out(before: dict[str, Any] | None, after: dict[str, Any] | None)
     return {name: count for name, count in counts.items() if count}
 
 
-def wrote(path: str, description: Description, messages: list[dict[str, Any]]) -> bool:
+def row_of(message: dict[str, Any]) -> Row:
+    """A force message as a row of numbers.
+
+    Numbers alone: Python's garbage collector looks at every list of a message that is kept, and no command is sent meanwhile.
+    """
+    per_tool = ("sequence", "flags", "force_scale", "position_m", "force_n")
+    row = [message["tick"], message["server_time_ns"]]
+    for sequence, flags, scale, position, force in zip(*(message[name] for name in per_tool), strict=True):
+        row += [sequence, flags, scale, *position, *force]
+    return tuple(row)
+
+
+def wrote(path: str, description: Description, rows: list[Row]) -> bool:
     """Write every received tick as CSV: position and force of each tool. False, with a message, if it can't be written."""
     from palpate.files import write_atomically
 
@@ -143,14 +157,7 @@ def wrote(path: str, description: Description, messages: list[dict[str, Any]]) -
     columns = ("sequence", "flags", "force_scale", *vectors)
     header = [f"{tool.name}.{column}" for tool in description.tools for column in columns]
     writer.writerow(["tick", "server_time_ns", *header])
-    per_tool = ("sequence", "flags", "force_scale", "position_m", "force_n")
-    for message in messages:
-        row = [message["tick"], message["server_time_ns"]]
-        for sequence, flags, scale, position, force in zip(
-            *(message[name] for name in per_tool), strict=True
-        ):
-            row += [sequence, flags, scale, *position, *force]
-        writer.writerow(row)
+    writer.writerows(rows)
     try:
         write_atomically(Path(path), table.getvalue().encode())
     except OSError as error:
