@@ -4,6 +4,10 @@ Nothing is reduced: the modes are all that the body has, so there is no residual
 with its memory, is advanced by the exponential of its equations under a force that is constant. The contact is solved by
 nonnegative least squares: forces along the normals at rest, complementary to the gap along them (Signorini). The sphere hangs
 on a spring, as the server's tip does.
+
+The gap is measured as the server measures it (docs/contact.md), so this is a reference for body, time and solver. It is closed in every
+tick: the server leaves what its equations did not foresee, such as the drift of a tick, as old penetration. What the
+kinematics of the contact are worth is seen by Hertz's and Sneddon's solutions and by finite elements.
 """
 
 from __future__ import annotations
@@ -92,11 +96,10 @@ def press(body: FullBody, tip: Tip, positions_m: Floats, period_s: float) -> tup
         load = np.zeros((len(near), 3))
         reaction, drift = np.zeros(3), np.zeros(3)
         if len(rows):
-            limits = np.minimum(gap[rows], 0.0) - gap[rows]
             spring = felt[rows] @ felt[rows].T / tip.stiffness_n_per_m
             blocks = compliance.reshape(len(near), 3, len(near), 3)[rows][:, :, rows]
             matrix = np.einsum("pi,piqj,qj->pq", inward[rows], blocks, inward[rows]) + spring
-            pressed = complementary(matrix, closing[rows] - limits)
+            pressed = complementary(matrix, closing[rows] + gap[rows])
             load[rows] = pressed[:, None] * inward[rows]
             reaction = pressed @ felt[rows]
             drift = pressed @ displacement[rows] / max(pressed.sum(), 1e-300)
@@ -108,11 +111,17 @@ def press(body: FullBody, tip: Tip, positions_m: Floats, period_s: float) -> tup
 
 
 def _sphere(away: Floats, inward: Floats, radius: float) -> tuple[Floats, Floats]:
-    """Of points `away` (m, 3) from its center: how far the sphere reaches along their inward normals (m,), and the gradient of the gap (m, 3)."""
+    """Of points `away` (m, 3) from its center: how far the tip reaches along their inward normals (m,), and the gradient of the gap (m, 3).
+
+    Where a sphere is steeper than 60 degrees, the tip is the cone that touches it there.
+    """
     beside = away - np.einsum("pi,pi->p", away, inward)[:, None] * inward
-    squared = np.einsum("pi,pi->p", beside, beside)
-    depth = np.sqrt(np.maximum(radius**2 - squared, 0.0))
-    return depth, inward + beside / np.maximum(depth, 0.1 * radius)[:, None]
+    lateral = np.sqrt(np.einsum("pi,pi->p", beside, beside))
+    edge = radius * np.sqrt(3.0) / 2
+    round_depth = np.sqrt(radius**2 - np.minimum(lateral, edge) ** 2)
+    depth = round_depth - np.sqrt(3.0) * np.maximum(lateral - edge, 0.0)
+    slope = np.where(lateral < edge, 1 / round_depth, np.sqrt(3.0) / np.maximum(lateral, edge))
+    return depth, inward + slope[:, None] * beside
 
 
 def _distance(points: Floats, positions: Floats) -> Floats:

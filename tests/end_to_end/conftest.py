@@ -340,7 +340,7 @@ class RawClient:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
-    def command(self, position_m: dict[str, list[float]], sequence: int | None = None) -> int:
+    def command(self, position_m: dict[str, list[float]], sequence: int | None = None, **fields: Any) -> int:
         if sequence is None:
             self.sequence += 1
             sequence = self.sequence
@@ -350,7 +350,7 @@ class RawClient:
             "client_time_ns": time.monotonic_ns(),
             "position_m": position_m,
         }
-        self.put(msgpack.packb(message))
+        self.put(msgpack.packb(message | fields))
         return sequence
 
     @contextmanager

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import time
 import tomllib
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ from numpy.typing import NDArray
 
 from full_contact import FullBody, Tip, full_body, press
 from palpate.build_surface import build_surface_model
-from palpate.model_file import SurfaceModel, ToolShape
-from palpate.scene.schema import Config, check_config
-from palpate_server.coupling.models import tools_of
+from palpate.model_file import SurfaceModel
+from palpate.plots import in_band
+from palpate.scene.schema import check_config
+from palpate_client import Connection, Tool
+from palpate_client.messages import Force
 from palpate_server.recording.replay import read_recording
 from palpate_server.simulation import Simulation
 
@@ -59,7 +62,7 @@ region = "plane"
 point_m = [0.0, 0.044, 0.0]
 normal = [0.0, 1.0, 0.0]
 [surface]
-band_hz = [0.0, 20.0]
+band_hz = [0.0, 30.0]
 [[tool]]
 name = "tip"
 radius_m = 0.02
@@ -87,9 +90,9 @@ def heights(place: Floats, normal: Floats, *heights_m: float) -> Floats:
     return place + np.array(heights_m)[:, None] * normal
 
 
-def poke(place: Floats, normal: Floats, depth_m: float, press_s: float = 0.2) -> Floats:
+def poke(place: Floats, normal: Floats, depth_m: float, hold_s: float = 0.1) -> Floats:
     """(n, 3), m: press, hold, and leave; `place` touches without pressing."""
-    times = np.cumsum([0.0, press_s, 0.1, press_s, 0.05]).tolist()
+    times = np.cumsum([0.0, 0.2, hold_s, 0.2, 0.05]).tolist()
     return along(times, heights(place, normal, 1e-3, -depth_m, -depth_m, 1e-3, 1e-3))
 
 
@@ -162,59 +165,177 @@ def test_a_shorter_period_changes_little_of_the_forces_with_all_modes(
     assert error(coarse, finer) < 0.01
 
 
+@dataclass(frozen=True)
+class Touch:
+    """Every tick of a touch, from a tool at rest outside, over tissue at rest, as the server recorded it.
+
+    position_m, force_n (n, 3); force_scale (n,); received (n,): whether its force came over the wire
+    """
+
+    position_m: Floats
+    force_n: Floats
+    force_scale: Floats
+    received: NDArray[np.bool_]
+
+
+def touches(served: Any, recordings: Path, name: str, paths: list[Floats]) -> list[Touch]:
+    """Move a tool along paths, each from tissue at rest, as a client does.
+
+    A path takes as many ticks as the machine makes it take. One in which the server lifted the tool, because no command
+    came for 70 ms, is repeated.
+    """
+    forces: dict[int, tuple[float, ...]] = {}
+    spans = []
+    gc.collect()
+    gc.freeze()  # a full collection would keep commands back for tenths of a second
+    try:
+        with (
+            Connection(served.endpoint, "test") as connection,
+            Tool(connection, name, silence_s=30.0) as tool,
+        ):
+            scales: list[tuple[int, float]] = []
+
+            def receive(force: Force) -> None:
+                forces[force.tick] = tuple(force.force_n)
+                scales.append((force.tick, force.force_scale))
+
+            connection.on_tool_force(name, receive)
+            # No faster than a hand, also when many commands come at once.
+            connection.control("limits", limits={"max_speed_m_per_s": 0.1})
+            connection.control("record", file="touches.mcap")
+            for path in paths:
+                for _ in range(20):
+                    connection.control("reset")
+                    begin = come_to(tool, path[0].tolist())
+                    for position in paced(path):
+                        tool.move(position)
+                    end = newest(tool).tick
+                    if all(scale > 0 for tick, scale in scales if begin <= tick < end):
+                        break
+                else:
+                    raise AssertionError("20 times the tool was lifted in the middle")
+                spans.append((begin, end))
+            report = connection.control("record", file=None)["recording"]
+    finally:
+        gc.unfreeze()
+    assert report["error"] is None
+    assert tool.contract.broken == []
+    recorded = read_recording(recordings / "touches.mcap")
+    ticks, port = recorded.ticks["tick"], recorded.ports[:, 0]
+    result = []
+    for begin, end in spans:
+        part = slice(*np.searchsorted(ticks, [begin, end]))
+        assert np.array_equal(ticks[part], np.arange(begin, end))
+        assert recorded.ticks["tissue_stored_j"][part.start] == 0  # at rest
+        received = np.isin(ticks[part], list(forces))
+        came = np.array([forces[tick] for tick in ticks[part][received].tolist()])
+        assert np.array_equal(came, port["force_n"][part][received])
+        result.append(
+            Touch(*(port[name][part] for name in ("position_m", "force_n", "force_scale")), received)
+        )
+    return result
+
+
+def newest(tool: Tool) -> Force:
+    assert tool.newest is not None
+    return tool.newest
+
+
+def paced(path: Floats) -> Iterator[list[float]]:
+    """Its positions, each at least a millisecond after the one before."""
+    due_s = time.monotonic()
+    for position in path.tolist():
+        time.sleep(max(0.0, due_s - time.monotonic()))
+        due_s = max(due_s, time.monotonic()) + 1e-3
+        yield position
+
+
+def come_to(tool: Tool, position: list[float]) -> int:
+    """Hold a tool at a position until its force is whole; that tick."""
+    began_ns = time.monotonic_ns()
+    for there in paced(np.tile(position, (60_000, 1))):
+        tool.move(there)
+        force = newest(tool)
+        is_whole = force.force_scale == 1.0 and np.allclose(force.position_m, position, rtol=0, atol=1e-9)
+        if is_whole and force.server_time_ns > began_ns:
+            return force.tick
+    raise AssertionError(f"the tool does not come to {position}: {tool.newest}")
+
+
+def difference(touch: Touch, body: FullBody, tip: Tip, period_s: float) -> Floats:
+    """(n, 3): force error of every tick, over the largest force."""
+    exact = touch.force_scale[:, None] * press(body, tip, touch.position_m, period_s)[0]
+    in_contact = np.any(exact != 0, axis=1)
+    assert np.mean(touch.force_scale[in_contact] == 1) > 0.8
+    assert np.mean(touch.received[in_contact]) > 0.8
+    largest = np.max(np.linalg.norm(exact, axis=1))
+    assert largest > 0.05
+    return (touch.force_n - exact) / largest
+
+
+def worst(difference: Floats) -> float:
+    return float(np.max(np.linalg.norm(difference, axis=1)))
+
+
+def places(model: SurfaceModel, n: int) -> Iterator[tuple[Floats, Floats]]:
+    """Where the tool touches the undeformed surface without pressing, (3,), m, and the outward normal, at n random points.
+
+    Not at a rim, around which the surface turns by more than 60 degrees within the tool's radius: contact is that of linear theory.
+    """
+    radius = model.tools[0].radius_m
+    near = np.linalg.norm(model.points[:, None] - model.points, axis=2) < radius
+    turn = np.min(np.where(near, model.normals @ model.normals.T, 1.0), axis=1)
+    candidates = np.flatnonzero(~model.held & (turn > 0.5))
+    assert len(candidates) > 0.7 * np.count_nonzero(~model.held)
+    for point in np.random.default_rng(5).choice(candidates, n, replace=False):
+        normal = model.normals[point]
+        away = model.points - model.points[point]
+        beside = np.linalg.norm(away - (away @ normal)[:, None] * normal, axis=1)
+        under = beside < radius
+        height = np.max(away[under] @ normal + np.sqrt(radius**2 - beside[under] ** 2))
+        yield model.points[point] + height * normal, normal
+
+
+def test_a_client_feels_a_poke_on_a_block_as_with_all_its_modes(
+    block: tuple[SurfaceModel, FullBody], serve: Callable[..., Any], tmp_path: Path
+) -> None:
+    model, body = block
+    radius = model.tools[0].radius_m
+    served = serve("--recordings", str(tmp_path), model=model)
+    path = poke(np.array([0.024, 0.036, 0.036 + radius]), np.array([0.0, 0.0, 1.0]), 4e-3)
+    (touch,) = touches(served, tmp_path, "tip", [path])
+    error = difference(touch, body, Tip(radius, STIFFNESS_N_PER_M), model.period_s)
+    assert worst(in_band(error, model.band_hz, model.period_s)) < model.accuracy.error_in_working_area
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_a_client_feels_pokes_at_20_places_of_the_liver_and_three_slides_as_with_all_its_modes(
-    serve: Callable[..., Any], connect: Callable[..., Any], tmp_path: Path
+    serve: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """A tool for each place: its home is where it comes from."""
     config = check_config(tomllib.loads(LIVER), "liver")
-    model, names = at_places(build_surface_model(config, CONFIGS), config, 23)
-    body = full_body(config, CONFIGS)
-    served = serve("--recordings", str(tmp_path), model=model)
-    errors = []
-    with connect(served.endpoint) as client:
-        for i, name in enumerate(names):
-            granted, answer = client.acquire(name)
-            assert granted, answer
-            tool = answer["tools"][name]
-            assert tool["stiffness_n_per_m"] == STIFFNESS_N_PER_M
-            start, normal = np.array(tool["home_m"]), np.array(tools_of(model)[i].normal)
-            path = poke(start, normal, 6e-3) if i < 20 else slide(start, normal, 4e-3, 0.025)
-            client.control("reset")
-            client.record(f"{name}.mcap")
-            for position in np.concatenate([np.tile(path[0], (500, 1)), path]):
-                client.command({name: position.tolist()})
-                time.sleep(1e-3)
-            assert client.control("record", file=None)[0]
-            client.control("release")
-            received = {message["tick"]: message["force_n"][i] for message in client.forces}
-            recorded = read_recording(tmp_path / f"{name}.mcap")
-            is_felt, ticks = recorded.ports[:, i]["force_scale"] > 0, recorded.ticks["tick"]
-            positions = np.where(is_felt[:, None], recorded.ports[:, i]["position_m"], path[0])
-            tip = Tip(model.tools[i].radius_m, STIFFNESS_N_PER_M)
-            exact, _ = press(body, tip, positions, model.period_s)
-            whole = (recorded.ports[:, i]["force_scale"] == 1) & np.isin(ticks, list(received))
-            assert np.count_nonzero(whole) > 0.8 * len(path)
-            force = np.array([received[tick] for tick in ticks[whole].tolist()])
-            errors.append(error(force, exact[whole]))
-            largest = np.max(np.linalg.norm(exact, axis=1))
-            assert largest > 0.1
-            print(f"{name}: {largest:.3g} N, {100 * errors[-1]:.2g} %")
-    assert np.max(errors) < model.accuracy.error_in_working_area
-
-
-def at_places(model: SurfaceModel, config: Config, n: int) -> tuple[SurfaceModel, list[str]]:
-    """The model with n tools that come to random points from outside."""
-    points = np.random.default_rng(5).choice(np.flatnonzero(~model.held), n, replace=False)
-    shape = model.tools[0]
-    tools = [
-        ToolShape(
-            f"tip{i}",
-            shape.radius_m,
-            0.0,
-            tuple((model.points[p] + 2 * shape.radius_m * model.normals[p]).tolist()),
-        )
-        for i, p in enumerate(points)
+    model, body = build_surface_model(config, CONFIGS), full_body(config, CONFIGS)
+    assert model.accuracy.error_in_band <= 0.05
+    assert model.accuracy.error_static <= 0.01
+    around = list(places(model, 23))
+    paths = [poke(*place, 6e-3, 0.4) for place in around[:20]] + [
+        slide(*place, 4e-3, 0.025) for place in around[20:]
     ]
-    return replace(model, tools=tuple(tools)), [tool.name for tool in tools]
+    served = serve("--recordings", str(tmp_path), "--workspace-m", "0.5", model=model)
+    tip = Tip(model.tools[0].radius_m, STIFFNESS_N_PER_M)
+    found = []
+    print(f"\n{model.n_modes} modes; stated {100 * model.accuracy.error_in_band:.2g} %")
+    for touch, path in zip(touches(served, tmp_path, "tip", paths), paths, strict=True):
+        error = difference(touch, body, tip, model.period_s)
+        is_held = np.linalg.norm(touch.position_m - path[len(path) // 2], axis=1) < 1e-9
+        held = error[is_held][-200:].mean(axis=0, keepdims=True)  # of a slide one tick or none
+        in_30_hz = in_band(error, (0.0, 30.0), model.period_s)
+        found.append((worst(error), worst(in_30_hz), worst(held) if is_held.sum() >= 300 else 0.0))
+        print(len(error), "ticks:", *(f"{100 * one:.2g} %" for one in found[-1]))
+    _, in_30_hz, at_rest = np.max(found, axis=0)
+    assert np.count_nonzero(np.array(found)[:, 2]) == 20
+    assert in_30_hz < 0.05
+    # 1 % where one point is under the tip. Where few points carry it off its axis, the tissue that moves sidewards opens and
+    # closes gaps that a tick does not foresee, and the server leaves some of that as penetration.
+    assert np.median(found, axis=0)[2] < 0.01
+    assert at_rest < 0.04

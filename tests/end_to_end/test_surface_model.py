@@ -11,11 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from palpate.model_file import ReducedModel, SurfaceModel, save_model
 from palpate_client import Connection, Tool, steps
+from palpate_client.local_server import free_endpoint
 from palpate_client.wire import Flags
 from palpate_server.coupling.models import tools_of
+from palpate_server.diagnostics.sample_surface import half_space_model
 from palpate_server.recording import replay
 from palpate_server.session.devices import PROFILES
 from palpate_server.simulation import Simulation
@@ -91,22 +94,27 @@ def test_two_clients_with_one_tool_each_feel_each_other(
             granted, answer = client.acquire(tool)
             assert granted, answer
 
-        def felt() -> float:
-            """What the first one feels, by the mean of some ticks."""
-            count = len(first.forces)
-            first.force_when(lambda force: len(first.forces) > count + 50, "some ticks")
-            return float(np.mean([force["force_n"][0][2] for force in first.forces[-50:]]))
+        def felt(other_touches: bool) -> float:
+            """What the first one feels, by the mean of 50 ticks.
 
-        with first.pressing({"tip": below(one, -1e-3)}):
-            first.force_when(lambda force: force["force_scale"][0] == 1.0, "the end of the soft start")
+            On a busy machine commands stay away until a force fades and the tool is lifted, so only whole forces count.
+            """
+            whole: list[float] = []
+
+            def is_enough(force: dict[str, Any]) -> bool:
+                is_whole = force["force_scale"] == [1.0, 1.0] and force["n_contact_points"][0] > 2
+                if is_whole and (force["n_contact_points"][1] > 2) == other_touches:
+                    whole.append(force["force_n"][0][2])
+                return len(whole) == 50
+
+            first.force_when(is_enough, "50 ticks with whole forces")
+            return float(np.mean(whole))
+
         with first.pressing({"tip": below(one, 2e-3)}):
-            first.force_when(lambda force: force["flags"][0] & Flags.IN_CONTACT, "contact")
             with second.pressing({"tip1": below(other, -2e-3)}):
-                second.force_when(lambda force: force["force_scale"][1] == 1.0, "the other's soft start")
-                alone = felt()
+                alone = felt(other_touches=False)
             with second.pressing({"tip1": below(other, 4e-3)}):
-                second.force_when(lambda force: force["n_contact_points"][1] > 2, "the other's contact")
-                beside = felt()
+                beside = felt(other_touches=True)
     assert alone > 0.02
     assert abs(beside - alone) > 0.05 * alone
 
@@ -192,6 +200,95 @@ def test_the_headless_client_and_the_bridge_run_unchanged(
     assert (code, err) == (0, ""), err  # no warning either
 
 
+def test_three_tools_of_two_clients_are_repeated_bit_for_bit_and_are_in_the_black_box(
+    serve: Callable[..., Any],
+    connect: Callable[..., Any],
+    wait_for: Callable[..., Any],
+    make_surface_model: Callable[..., SurfaceModel],
+    tmp_path: Path,
+) -> None:
+    """One slides in circles, one presses, one with a smaller tip holds the tissue and pulls it."""
+    model = make_surface_model(3)
+    homes = ((-0.01, -0.008, 0.02), (0.01, -0.008, 0.02), (0.0, 0.01, 0.02))
+    tools = tuple(replace(tool, home_m=home) for tool, home in zip(model.tools, homes, strict=True))
+    model = replace(model, tools=tools)
+    folders = ("--recordings", str(tmp_path), "--black-box", str(tmp_path / "box"))
+    served = serve(*folders, model=model)
+    with connect(served.endpoint) as first, connect(served.endpoint) as second:
+        homes = first.acquire("tip", "tip1")[1]["tools"]
+        (x, y, z), presses = homes["tip"]["home_m"], homes["tip1"]["home_m"]
+        pulled = second.acquire("tip2", radius_m=0.0045)[1]["tools"]["tip2"]["home_m"]
+        first.record("a.mcap")
+        looked_at, touched, attached = 0, 0, 0
+        give_up = time.monotonic() + 60
+        for i in itertools.count():
+            depth = 1e-3 * np.interp(i, [250, 350], [-1.0, 2.0])
+            circle = 3e-3 * np.array([np.cos(0.02 * i), np.sin(0.02 * i)])
+            first.command(
+                {
+                    "tip": [x + circle[0], y + circle[1], z - depth],
+                    "tip1": [presses[0], presses[1], presses[2] - depth],
+                }
+            )
+            height = 1e-3 * np.interp(i, [250, 350, 500, 700], [1.0, -2.0, -2.0, 1.0])
+            second.command({"tip2": [pulled[0], pulled[1], pulled[2] + height]}, attach={"tip2": i > 400})
+            messages = first.forces[looked_at:]
+            looked_at += len(messages)
+            touched += sum(min(message["n_contact_points"]) > 0 for message in messages)
+            attached += sum(bool(message["flags"][2] & Flags.ATTACHED) for message in messages)
+            if i > 900 and min(touched, attached) > 100:
+                break
+            assert time.monotonic() < give_up, (touched, attached)
+            time.sleep(1e-3)
+        assert first.control("record", file=None)[0]
+        written = wait_for(lambda: list((tmp_path / "box").glob("*-stale.npz")), "a file of the silence")
+    recorded = assert_all_is_repeated(tmp_path / "a.mcap", model)
+    assert np.count_nonzero(np.all(recorded.ports["n_contact_points"] > 0, axis=1)) > 100
+    with np.load(written[0], allow_pickle=False) as box:
+        assert box["tools"].tolist() == ["tip", "tip1", "tip2"]
+        in_both = np.isin(box["ticks"]["tick"], recorded.ticks["tick"])
+        same = np.isin(recorded.ticks["tick"], box["ticks"]["tick"])
+        assert np.count_nonzero(same) > 100
+        assert box["ports"][in_both].tobytes() == recorded.ports[same].tobytes()
+
+
+def test_a_model_whose_points_are_too_close_for_its_tool_is_refused_and_the_server_goes_on(
+    serve: Callable[..., Any],
+    connect: Callable[..., Any],
+    start: Callable[..., Any],
+    make_surface_model: Callable[..., SurfaceModel],
+    tmp_path: Path,
+) -> None:
+    model = make_surface_model()
+    close = half_space_model(model.tools, 21, 3e-4, n_modes=6)
+    nowhere_wrong = replace(model.accuracy, error_map=np.zeros(close.n_points, np.float32))
+    close = replace(
+        close, n_nodes=close.n_points, accuracy=nowhere_wrong, config_sha256="6f" * 32, built_with="the tests"
+    )
+    save_model(close, tmp_path / "close.npz")
+    served = serve(model=model)
+    words = "radius_m = 0.005 is near 441 points"
+    with connect(served.endpoint) as client:
+        x, y, z = client.acquire("tip")[1]["tools"]["tip"]["home_m"]
+        with client.pressing({"tip": [x, y, z - 2e-3]}):
+            client.force_when(lambda force: force["force_scale"] == [1.0], "the end of the soft start")
+            granted, refusal = client.control("load", file="close.npz")
+            assert (granted, refusal["reason"]) == (False, "bad_model")
+            assert words in refusal["message"]
+            assert "expected at most 400" in refusal["message"]
+            assert "\n" not in refusal["message"]
+            after = client.force_when(lambda force: force["force_scale"] == [1.0], "a whole force")
+            assert after["force_n"][0][2] > 0.01
+            assert client.next_status()["model"]["config_sha256"] == model.config_sha256
+            assert client.control("load", file="model1.npz")[0]
+    code, out, err = start(
+        "-m", "palpate_server", tmp_path / "close.npz", "--listen", free_endpoint()
+    ).finish()
+    assert (code, out) == (2, "")
+    (line,) = err.strip().splitlines()
+    assert words in line
+
+
 @pytest.mark.slow
 def test_models_of_both_kinds_are_loaded_in_turns_while_the_tool_presses_and_all_is_repeated(
     serve: Callable[..., Any],
@@ -232,10 +329,15 @@ def test_models_of_both_kinds_are_loaded_in_turns_while_the_tool_presses_and_all
                 assert len(geometry["vertices_m"]) == 12 * geometry["n_vertices"]
                 assert surfaces, "a surface"
             assert kinds == ["surface", "patch", "surface"]
-            end = client.force_when(lambda force: True, "a force")
+            client.force_when(
+                lambda force: (
+                    force["force_scale"] == [1.0]
+                    and force["flags"][0] & Flags.IN_CONTACT
+                    and force["force_n"][0][2] > 0.01
+                ),
+                "a whole force",
+            )
         assert client.control("record", file=None)[0]
-    assert end["flags"][0] & Flags.IN_CONTACT
-    assert end["force_n"][0][2] > 0.01
     recorded = assert_all_is_repeated(tmp_path / "a.mcap", surface, softer, patch)
     limit = 2000.0 * 1e-3  # N, --max-force-rate-n-per-s
     assert np.linalg.norm(np.diff(recorded.ports["force_n"][:, 0], axis=0), axis=1).max() < 0.02 * limit
@@ -248,9 +350,15 @@ def test_what_a_stiffer_model_gives_a_hand_that_pressed_a_soft_one_is_counted_ap
     make_surface_model: Callable[..., SurfaceModel],
     tmp_path: Path,
 ) -> None:
-    """Pressed in soft, let go stiff: the hand gets out more than it put in. Each model by itself gives out nothing."""
+    """Pressed in soft, let go stiff: the hand gets out more than it put in. Each model by itself gives out nothing.
+
+    On a busy machine commands may stay away until the tool is lifted. The energies balance then too, but the hand has put in
+    more: so it tries again.
+    """
     soft, stiff = make_surface_model(softness=6.0), make_surface_model()
-    save_model(replace(stiff, name="stiff", config_sha256="6f" * 32), tmp_path / "stiff.npz")
+    stiff = replace(stiff, name="stiff", config_sha256="6f" * 32)
+    save_model(soft, tmp_path / "soft.npz")
+    save_model(stiff, tmp_path / "stiff.npz")
     served = serve("--recordings", str(tmp_path), model=soft)
     with connect(served.endpoint) as client:
         x, y, z = client.acquire("tip")[1]["tools"]["tip"]["home_m"]
@@ -260,30 +368,45 @@ def test_what_a_stiffer_model_gives_a_hand_that_pressed_a_soft_one_is_counted_ap
                 client.command({"tip": [x, y, z + height]})
                 time.sleep(1e-3)
 
-        with client.pressing({"tip": [x, y, z + 1e-3]}):
-            client.force_when(lambda force: force["force_scale"] == [1.0], "the end of the soft start")
-            client.record("a.mcap")
-        move(1e-3, -3e-3)
-        with client.pressing({"tip": [x, y, z - 3e-3]}):
-            granted, answer = client.control("load", file="stiff.npz")
+        def load(name: str) -> None:
+            granted, answer = client.control("load", file=name)
             assert granted, answer
-        move(-3e-3, 1e-3)
-        with client.pressing({"tip": [x, y, z + 1e-3]}):
-            client.force_when(lambda force: force["n_contact_points"] == [0], "the end of contact")
-            assert client.control("record", file=None)[0]
-    recorded = assert_all_is_repeated(
-        tmp_path / "a.mcap", soft, replace(stiff, name="stiff", config_sha256="6f" * 32)
-    )
-    ticks, tip = recorded.ticks, recorded.ports[:, 0]
-    kept = tip["stored_j"] + tip["dissipated_j"] + ticks["tissue_stored_j"] + ticks["tissue_dissipated_j"]
+
+        for attempt in range(10):
+            with client.pressing({"tip": [x, y, z + 1e-3]}):
+                load("soft.npz")
+                assert client.control("reset")[0]
+                client.force_when(lambda force: force["force_scale"] == [1.0], "the end of the soft start")
+                client.record(f"{attempt}.mcap")
+            move(1e-3, -3e-3)
+            with client.pressing({"tip": [x, y, z - 3e-3]}):
+                load("stiff.npz")
+            move(-3e-3, 1e-3)
+            with client.pressing({"tip": [x, y, z + 1e-3]}):
+                client.force_when(lambda force: force["n_contact_points"] == [0], "the end of contact")
+                assert client.control("record", file=None)[0]
+            recorded = assert_all_is_repeated(tmp_path / f"{attempt}.mcap", soft, stiff)
+            felt, tip = what_a_hand_felt(recorded), recorded.ports[:, 0]
+            if np.min(tip["force_scale"]) > 0:
+                break
+        else:
+            raise AssertionError("10 times the tool was lifted in the middle")
     largest = np.max(tip["work_j"])
+    assert felt[-1] < -0.2 * largest  # the hand has gained
+    assert tip["withheld_j"][-1] > 0.2 * largest
+
+
+def what_a_hand_felt(recorded: replay.Recorded) -> NDArray[np.float64]:
+    """(n_ticks,), J: the work that it did on the device, after a look at the ledger."""
+    ticks, tip = recorded.ticks, recorded.ports[:, 0]
+    largest = np.max(tip["work_j"])
+    kept = tip["stored_j"] + tip["dissipated_j"] + ticks["tissue_stored_j"] + ticks["tissue_dissipated_j"]
     np.testing.assert_allclose(tip["work_j"], kept, rtol=0, atol=1e-9 * largest)
     assert np.min(tip["work_j"]) >= -1e-9
     steps_m = np.diff(tip["position_m"], axis=0, prepend=tip["position_m"][:1])
-    felt = -np.cumsum(np.einsum("ti,ti->t", tip["force_n"], steps_m))
+    felt: NDArray[np.float64] = -np.cumsum(np.einsum("ti,ti->t", tip["force_n"], steps_m))
     np.testing.assert_allclose(tip["work_j"] - tip["withheld_j"], felt, rtol=0, atol=1e-6 * largest)
-    assert felt[-1] < -0.2 * largest  # the hand has gained
-    assert tip["withheld_j"][-1] > 0.2 * largest
+    return felt
 
 
 def test_a_tool_that_is_lost_while_it_presses_fades_and_is_lifted_off(
