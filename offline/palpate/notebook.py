@@ -153,7 +153,10 @@ def plot_modes(full: FullModel, config: Config, count: int = 4) -> Figure:
 
 
 def plot_error_map(model: SurfaceModel) -> Figure:
-    """The error of the force in the band at every point of the surface, in percent; held points count as 0."""
+    """The error of the force in the band over the surface, in percent: at each point that of the nearest one where it was measured.
+
+    It is 100 % where the points are too far apart to carry the smallest tool, and 0 at held points.
+    """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 

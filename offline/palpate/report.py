@@ -6,6 +6,8 @@ import numpy as np
 
 from palpate.model_file import Contact, ReducedModel, SurfaceModel
 from palpate.model_file.advice import NOTABLE_ERROR, force_advice, percent
+from palpate.model_file.contact_size import carried_share, point_spacings
+from palpate.model_file.surface_model import SAMPLE_SIZE
 
 GOOD_ERROR = 0.05  # below what a hand tells apart: from about 7 % of a force (Pang, Tan & Durlach 1991)
 
@@ -116,19 +118,20 @@ def _surface_text(model: SurfaceModel, verbose: bool) -> str:
     accuracy, (low, high) = model.accuracy, model.band_hz
     n_free = int(np.count_nonzero(~model.held))
     radius = min(tool.radius_m for tool in model.tools)
-    carried = accuracy.resolved_frequency_hz
+    carried = carried_share(model.points, model.triangles, radius)
     rows = [
-        ("force while moving", f"wrong by at most {percent(accuracy.error_in_working_area)}", f"motions of {low:g} to {high:g} Hz, at the worst point of the working areas"),
-        ("", f"wrong by at most {percent(accuracy.error_in_band)}", f"at the worst of all {n_free:,} points; median {percent(accuracy.error_in_band_median)}"),
-        ("force at rest", f"wrong by {percent(accuracy.error_static)}", f"at the worst of a sample of the points; median {percent(accuracy.error_static_median)}"),
-        ("mesh", f"carries waves up to {carried:.3g} Hz", "where it is coarsest"),
-        ("energy", "never given out", f"passivity margin {accuracy.passivity_margin:.1g}, sampled {accuracy.passivity_margin_sampled:.1g}"),
+        ("force while moving", f"wrong by at most {percent(accuracy.error_in_working_area)}", f"motions of {low:g} to {high:g} Hz, at the worst sampled point of the working areas"),
+        ("", f"wrong by at most {percent(accuracy.error_in_band)}", f"at the worst sampled point of all; median {percent(accuracy.error_in_band_median)}"),
+        ("force at rest", f"wrong by {percent(accuracy.error_static)}", f"at the worst sampled point of all; median {percent(accuracy.error_static_median)}"),
+        ("surface", f"{percent(carried)} carries the tip", _elsewhere(model, carried, radius)),
+        ("mesh", f"carries waves up to {accuracy.resolved_frequency_hz:.3g} Hz", "where it is coarsest"),
+        ("energy", "never given out" if accuracy.is_passive else "can be given out", f"passivity margin {accuracy.passivity_margin:.1g}, sampled {accuracy.passivity_margin_sampled:.1g}"),
         ("largest stiffness", f"{accuracy.largest_stiffness_n_per_m:.3g} N/m", "in one tick, what a device can meet without a virtual coupling"),
     ]  # fmt: skip
     tools = ", ".join(f"{tool.name} ({1e3 * tool.radius_m:g} mm)" for tool in model.tools)
     lines = [
         f"\n{model.name}: {model.n_points:,} points to touch, {model.n_modes:,} modes, tools {tools}",
-        f"  errors are those of a tip of {1e3 * radius:g} mm radius, pressed in by half of it",
+        f"  errors are those of a tip of {1e3 * radius:g} mm radius, pressed in by half of it, at a sample of up to {SAMPLE_SIZE} points",
         *_columns(rows),
         f"  verdict: {_surface_verdict(model)}",
     ]
@@ -141,6 +144,14 @@ def _surface_text(model: SurfaceModel, verbose: bool) -> str:
         ("shift of the residual", f"{accuracy.residual_shift_m_per_n:.2g} m/N", "makes it definite in spite of rounding"),
     ]  # fmt: skip
     return "\n".join(lines + _details(figures, verbose))
+
+
+def _elsewhere(model: SurfaceModel, carried: float, radius_m: float) -> str:
+    """What is to be said of the rest of the surface."""
+    if carried == 1:
+        return f"of {1e3 * radius_m:g} mm"
+    spacing = float(point_spacings(model.points, model.triangles).max())
+    return f"of {1e3 * radius_m:g} mm; elsewhere points are up to {1e3 * spacing:.2g} mm apart: not to be touched"
 
 
 def _surface_verdict(model: SurfaceModel) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +135,9 @@ def test_the_model_is_judged_written_read_and_told(
     np.testing.assert_array_equal(read.residual, model.residual)
     text = accuracy_text(read, verbose=True)
     assert "322 points to touch, 60 modes" in text
+    assert "100 % carries the tip" in text
+    assert "points of all" not in text
+    assert "at a sample of up to 204 points" in text
     assert "never given out" in text
     assert not progress.warnings
     assert progress.stages[-4:] == ["modes", "static responses", "exact compliance", "evidence"]
@@ -182,8 +186,15 @@ def test_a_tool_that_is_too_small_for_the_points_is_warned_of_with_its_number() 
     tool = SCENE["tool"][0] | {"radius_m": 0.004}
     scene = SCENE | {"geometry": SCENE["geometry"] | {"counts": [5, 5, 4]}, "tool": [tool]}
     progress = _Progress()
-    build_surface_model(check_config(scene, "block"), Path(), progress)
+    model = build_surface_model(check_config(scene, "block"), Path(), progress)
     assert any("tool 'tip': radius_m = 0.004 touches about 0.1" in text for text in progress.warnings)
+    np.testing.assert_array_equal(model.accuracy.error_map, np.where(model.held, 0, 1))
+    text = accuracy_text(model)
+    assert "0 % carries the tip" in text
+    assert "points are up to 16 mm apart: not to be touched" in text
+    text = accuracy_text(replace(model, accuracy=replace(model.accuracy, passivity_margin=-1e-4)))
+    assert "never given out" not in text
+    assert "can be given out" in text
 
 
 def test_modes_that_end_within_the_band_are_refused() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from palpate.model_file.surface_model import SAMPLE_SIZE
 from palpate.modes.held_body import HeldBody
 from palpate.modes.lanczos import LowestModes
 from palpate.scene.material import PronySeries
@@ -17,9 +18,6 @@ from palpate.surface_model.ritz_vectors import added
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-
-SIZE = 204
-"""Points of a sample, all there are where that is fewer."""
 
 _WORKING = 0.75
 """Share of them in working areas."""
@@ -57,8 +55,8 @@ def sample_footprints(
     """
     rng = np.random.default_rng(0)
     others = np.setdiff1d(free, working)
-    n_others = min(len(others), SIZE - min(len(working), int(_WORKING * SIZE)))
-    inside = rng.choice(working, min(len(working), SIZE - n_others), replace=False)
+    n_others = min(len(others), SAMPLE_SIZE - min(len(working), int(_WORKING * SAMPLE_SIZE)))
+    inside = rng.choice(working, min(len(working), SAMPLE_SIZE - n_others), replace=False)
     points = np.sort(np.concatenate([inside, rng.choice(others, n_others, replace=False)]))
     loads = on_components(csr_array(footprints[points] @ rows)).T.toarray()
     return Sample(points, np.isin(points, working), loads)
