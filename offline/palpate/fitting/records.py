@@ -27,6 +27,10 @@ _FEWEST_FREQUENCIES = 5
 _HELD_WITHIN = 0.05  # a hold may deviate by this fraction
 _NOTABLE_DRIVE_NOISE = 0.003
 
+_DEEPEST = 0.5  # depth of an indentation over the tip's radius
+_TOUCH = 1e-12  # the same of a first touch
+_NEWTON_STEPS = 8
+
 
 @dataclass(frozen=True)
 class Specimen:
@@ -59,8 +63,8 @@ class TimeRecord:
     """A ramp and a hold. `response / drive` is a modulus, Pa, in a relaxation and a compliance, 1/Pa, in a creep test.
 
     time_s    (n,), strictly increasing
-    drive     what was held: strain or stress, Pa. In an indentation 4 sqrt(R) / (3 (1 - nu²)) depth^1.5, m², stands for
-              the strain, and the force, N, for the stress
+    drive     what was held: strain or stress, Pa. In an indentation `indentation_area`, m², stands for the strain, and the
+              force, N, for the stress
     response  what was measured meanwhile: the other one
     ramp_s    duration of the ramp; hold_s: of the hold
     """
@@ -152,8 +156,8 @@ def _options(names: dict[str, float]) -> str:
 
 
 def _indentation(shown: str, time_s: Array, depth: Array, force: Array, radius_m: float) -> TimeRecord:
-    """A rigid sphere on a half-space. While the contact grows, F(t) = 4 sqrt(R) / (3 (1 - nu²)) times the relaxation of
-    depth^1.5 (E. H. Lee and J. R. M. Radok, J. Appl. Mech. 27, 1960, for the contact of Hertz)."""
+    """A rigid sphere on a half-space. While the contact grows, F(t) is the relaxation of `indentation_area` (E. H. Lee and
+    J. R. M. Radok, J. Appl. Mech. 27, 1960; for any tip, G. A. C. Graham, Int. J. Eng. Sci. 3, 1965)."""
     sign = 1.0 if np.median(force) >= 0 else -1.0  # both may be counted against the surface's normal
     depth = depth if np.median(depth) >= 0 else -depth
     deepest = float(depth.max())
@@ -161,12 +165,11 @@ def _indentation(shown: str, time_s: Array, depth: Array, force: Array, radius_m
         raise ValueError(
             f"{shown}: displacement_m falls: expected a contact that only grows and holds (the model has no unloading)"
         )
-    if deepest > 0.5 * radius_m:
+    if deepest > _DEEPEST * radius_m:
         raise ValueError(
-            f"{shown}: displacement_m reaches {deepest:.3g}: expected at most half of --tip-radius-m, {0.5 * radius_m:.3g}, "
-            "where the contact of a sphere is that of Hertz"
+            f"{shown}: displacement_m reaches {deepest:.3g}: expected at most half of --tip-radius-m, "
+            f"{_DEEPEST * radius_m:.3g}: deeper, strains are too large for a linear tissue"
         )
-    contact = 4 * math.sqrt(radius_m) / (3 * (1 - POISSONS_RATIO**2)) * np.maximum(depth, 0.0) ** 1.5
     note = (
         f"{shown}: an indentation to {deepest:.3g} m, with Poisson's ratio {POISSONS_RATIO} assumed. It holds for a flat body at least "
         f"{10 * math.sqrt(radius_m * deepest):.2g} m thick (10 contact radii), without adhesion, "
@@ -175,10 +178,25 @@ def _indentation(shown: str, time_s: Array, depth: Array, force: Array, radius_m
     return time_record(
         shown,
         time_s,
-        Signal("contact (depth^1.5)", "m²", contact),
+        Signal("contact", "m²", indentation_area(depth, radius_m)),
         Signal("force", "N", sign * force),
         (note,),
     )
+
+
+def indentation_area(depth_m: Array, radius_m: float) -> Array:
+    """(n,), m²: the force of a rigid sphere on an elastic half-space over its Young's modulus, at depths (n,) below R.
+
+    With the radius a of the contact, depth = a artanh(a / R) and F (1 - nu²) / E = (a² + R²) artanh(a / R) - a R (I. N. Sneddon,
+    Int. J. Eng. Sci. 3, 1965). It is 4/3 sqrt(R) depth^1.5 for small depths (Hertz), and 5 % less at half the radius.
+    """
+    relative = np.maximum(depth_m / radius_m, _TOUCH)
+    # Newton's method for x = a / R; the function is convex, and begins between tanh and the root of Hertz.
+    x = np.tanh(np.sqrt(relative))
+    for _ in range(_NEWTON_STEPS):
+        x -= (x * np.arctanh(x) - relative) / (np.arctanh(x) + x / (1 - x**2))
+    area: Array = radius_m**2 * ((1 + x**2) * np.arctanh(x) - x) / (1 - POISSONS_RATIO**2)
+    return np.where(depth_m > 0, area, 0.0)
 
 
 def time_record(

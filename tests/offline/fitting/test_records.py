@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.fitting.records import POISSONS_RATIO, Specimen, TimeRecord, read_record
+from palpate.fitting.records import POISSONS_RATIO, Specimen, TimeRecord, indentation_area, read_record
 from palpate.fitting.tissue import fit_tissue
+from palpate.model_file import ToolShape
+from palpate_server.diagnostics.sample_surface import half_space_model
+from palpate_server.simulation import Simulation
 
 TIME_S = np.arange(0, 10.5, 0.1)
 RAMP = np.minimum(TIME_S / 0.5, 1)
@@ -155,19 +158,39 @@ def test_a_bar_of_given_length_and_area(tmp_path: Path) -> None:
 class TestIndentation:
     HEADER = "time_s,displacement_m,force_n"
 
-    def test_an_elastic_half_space_is_that_of_hertz(self, tmp_path: Path) -> None:
-        """F = 4/3 E / (1 - nu²) sqrt(R) depth^1.5 (K. L. Johnson, Contact Mechanics, Eq. 4.23)."""
-        depth = 1e-3 * RAMP
-        force = 4 / 3 * 3000 / (1 - POISSONS_RATIO**2) * math.sqrt(0.005) * depth**1.5
-        tissue = fit_tissue(
-            [
-                read_record(
-                    write(tmp_path / "r.csv", self.HEADER, TIME_S, depth, force), Specimen(tip_radius_m=0.005)
-                )
-            ]
-        )
-        assert tissue.modulus_pa.value == pytest.approx(3000, rel=1e-6)
-        assert any("half" not in n and "0.022 m thick" in n for n in tissue.notes)
+    def test_a_shallow_contact_is_that_of_hertz(self) -> None:
+        """F = 4/3 E / (1 - nu²) sqrt(R) depth^1.5 (K. L. Johnson, Contact Mechanics, Eq. 4.23); Sneddon's is 1 - 0.1 depth / R of it."""
+        depth = 0.005 * np.array([0.0, 1e-6, 1e-4, 1e-3])
+        hertz = 4 / 3 / (1 - POISSONS_RATIO**2) * math.sqrt(0.005) * depth**1.5
+        np.testing.assert_allclose(indentation_area(depth, 0.005), hertz, rtol=1.1e-4, atol=1e-22)
+
+    def test_its_slope_is_the_diameter_of_the_contact(self) -> None:
+        """dF / d(depth) = 2 a E / (1 - nu²) for every tip (I. N. Sneddon, Int. J. Eng. Sci. 3, 1965), depth = a artanh(a / R)."""
+        a = 0.005 * np.array([0.1, 0.3, 0.5, 0.63])
+        depth, step = a * np.arctanh(a / 0.005), 1e-7
+        slope = (indentation_area(depth + step, 0.005) - indentation_area(depth - step, 0.005)) / (2 * step)
+        np.testing.assert_allclose(slope * (1 - POISSONS_RATIO**2), 2 * a, rtol=1e-6)
+
+    def test_the_tissue_of_a_simulated_half_space_is_found(self, tmp_path: Path) -> None:
+        """The record is one of the contact that the server runs: points 0.6 mm apart, whose force is 1 % above Sneddon's."""
+        tip = ToolShape("tip", 0.004, 0.0, (0.0, 0.0, 0.1))
+        model = half_space_model([tip], 19, 6e-4, 5e3, prony=([0.6], [0.2]))
+        simulation = Simulation(model, 1e6)
+        time_s = model.period_s * np.arange(1, 1001)
+        depth = 0.5 * 0.004 * np.clip((time_s - 0.05) / 0.05, 0, 1)
+        force = [simulation.step({"tip": (0.0, 0.0, 0.004 - d)})["tip"].force_n[2] for d in depth]
+        path = write(tmp_path / "r.csv", self.HEADER, time_s, depth, np.array(force))
+        tissue = fit_tissue([read_record(path, Specimen(tip_radius_m=0.004))])
+        # The half-space is incompressible.
+        assert tissue.modulus_pa.value / (1 - POISSONS_RATIO**2) == pytest.approx(5e3 / 0.75, rel=0.025)
+        (branch,) = tissue.branches
+        assert branch.gamma.value == pytest.approx(0.6, rel=0.05)
+        assert branch.tau_s.value == pytest.approx(0.2, rel=0.05)
+
+    def test_the_body_that_is_needed_is_told(self, tmp_path: Path) -> None:
+        path = write(tmp_path / "r.csv", self.HEADER, TIME_S, 1e-3 * RAMP, RAMP**1.5)
+        notes = fit_tissue([read_record(path, Specimen(tip_radius_m=0.005))]).notes
+        assert any("0.022 m thick" in note for note in notes)
 
     def test_a_contact_that_shrinks_is_refused(self, tmp_path: Path) -> None:
         path = write(
@@ -176,7 +199,7 @@ class TestIndentation:
         with pytest.raises(ValueError, match="displacement_m falls"):
             read_record(path, Specimen(tip_radius_m=0.005))
 
-    def test_an_indentation_too_deep_for_hertz_is_refused(self, tmp_path: Path) -> None:
+    def test_an_indentation_too_deep_for_a_linear_tissue_is_refused(self, tmp_path: Path) -> None:
         path = write(tmp_path / "r.csv", self.HEADER, TIME_S, 3e-3 * RAMP, RAMP)
         with pytest.raises(ValueError, match=r"reaches 0\.003: expected at most half of --tip-radius-m"):
             read_record(path, Specimen(tip_radius_m=0.005))
