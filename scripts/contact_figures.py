@@ -27,7 +27,7 @@ def main() -> None:
     model = load_model(path)
     if not isinstance(model, SurfaceModel):
         sys.exit(f"{path}: expected a surface model, this is of kind {model.kind!r}")
-    felt, _ = replayed(model, surface_path(model, SECONDS), STIFFNESS_N_PER_M)
+    felt = replayed(model, surface_path(model, SECONDS), STIFFNESS_N_PER_M)
     figure = Figure(figsize=(13.5, 7.2), layout="constrained")
     halves: Any = figure.subfigures(1, 2, width_ratios=[1.0, 1.15])
     left, right = halves

@@ -109,6 +109,9 @@ def test_a_tool_presses_slides_and_lets_go_and_nothing_ever_pulls_it(tmp_path: P
         assert np.all(felt.work_j >= -1e-9)
     touched = slide.felt.position_m[slide.felt.n_points > 0]
     assert np.ptp(touched, axis=0).max() > 0.03
+    lines = "\n".join(slide.lines())
+    assert "never a pull" in lines
+    assert f"{1e3 * slide.felt.work_j[-1]:.3f} mJ of work by the tool = " in lines
     # Beside the error that the file states: points of this coarse block get in touch some ticks earlier or later.
     assert slide.error_in_band < slide.model.accuracy.error_in_working_area + 0.05
     assert_is_a_picture(demo.picture)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from palpate.model_file import SurfaceModel
 from palpate.plots import in_band
 from palpate.progress import Progress
 from palpate.surface_plots import Felt, draw_slide
-from palpate_client import Connection, Tool, steps
+from palpate_client import Connection, Surface, Tool, steps
 from palpate_server.simulation import Simulation
 
 Array = NDArray[np.float64]
@@ -32,7 +32,17 @@ _NEAR = 2.4
 """Radii from the tool's center within which points may be touched."""
 
 _STATUS_WAIT_S = 1.0
-_FIELDS = ("position_m", "force_n", "force_scale", "normal")
+_PER_TOOL = (
+    "position_m",
+    "force_n",
+    "force_scale",
+    "normal",
+    "n_contact_points",
+    "work_j",
+    "stored_j",
+    "dissipated_j",
+)
+_BALANCED_J = 1e-9
 
 
 @dataclass(frozen=True)
@@ -40,9 +50,10 @@ class Slide:
     """Results of a slide.
 
     client         summary of the contract, as `palpate client --json` prints it
-    felt           what came over the wire, and where the energy was
+    felt           what the server sent
     full           the same motion with the full model
-    displacement   (n_points, 3), m, of the surface halfway along the slide
+    displacement   (n_points, 3), m, of the surface about halfway along the slide, as the server sent it
+    lost           ticks whose force message did not come: interpolated
     error          largest force error over the largest force
     error_in_band  the same within the model's band
     """
@@ -52,21 +63,42 @@ class Slide:
     felt: Felt
     full: Felt
     displacement_m: Array
+    lost: int
     error: float
     error_in_band: float
 
     def lines(self) -> list[str]:
         """Forces, energies and error, for a person."""
-        felt, contact = self.felt, self.felt.n_points > 0
+        lost = [
+            f"lost          {self.lost:,} of {len(self.felt.time_s):,} ticks did not come and are interpolated"
+        ]
         return [
-            f"contact       {felt.n_points.max()} points at most; force along its normal {felt.normal_n[contact].min():+.3f} to "
-            f"{felt.normal_n.max():+.3f} N, never a pull; friction up to {felt.friction_n.max():.3f} N",
-            f"energy        {1e3 * felt.work_j[-1]:.3f} mJ of work by the tool = {1e3 * felt.stored_j[-1]:.3f} stored "
-            f"+ {1e3 * felt.dissipated_j[-1]:.3f} dissipated",
+            *lost[: self.lost],
+            f"contact       {self._contact()}",
+            f"energy        {self._energy()}",
             f"full model    served and full model's force differ by at most {100 * self.error_in_band:.2g} % of the largest force "
             f"below {self.model.band_hz[1]:g} Hz (the file states {100 * self.model.accuracy.error_in_working_area:.2g} %), by "
             f"{100 * self.error:.2g} % at every frequency",
         ]
+
+    def _contact(self) -> str:
+        felt, contact = self.felt, self.felt.n_points > 0
+        if not np.any(contact):
+            return "none"
+        least = float(felt.normal_n[contact].min())
+        pull = "never a pull" if least >= 0 else f"a pull (ticks: {np.count_nonzero(felt.normal_n < 0):,})"
+        return (
+            f"{felt.n_points.max()} points at most; force along its normal {least:+.3f} to {felt.normal_n.max():+.3f} N, {pull}; "
+            f"friction up to {felt.friction_n.max():.3f} N"
+        )
+
+    def _energy(self) -> str:
+        """At the last tick with an energy: the server counts anew when the tissue has come to rest."""
+        felt = self.felt
+        last = int(np.flatnonzero(felt.work_j)[-1]) if np.any(felt.work_j) else -1
+        work, stored, dissipated = (x[last] for x in (felt.work_j, felt.stored_j, felt.dissipated_j))
+        balance = "=" if abs(work - stored - dissipated) <= _BALANCED_J else "is not"
+        return f"{1e3 * work:.3f} mJ of work by the tool {balance} {1e3 * stored:.3f} stored + {1e3 * dissipated:.3f} dissipated"
 
     def draw(self, picture: Path) -> None:
         draw_slide(self.model, self.felt, self.full, self.displacement_m, picture)
@@ -83,47 +115,19 @@ def slide(
 
     reference  makes the full model of some points
 
-    Raises ClientError when server or client fail, ValueError when hardly any tick was received.
+    Raises ClientError when server or client fail, ValueError when hardly anything was received.
     """
     progress(f"press, slide, let go, {seconds:g} s")
     tool = model.tools[0]
-    path = surface_path(model, seconds)
-    velocity: Array = np.asarray(np.gradient(path, model.period_s, axis=0))
-    messages: list[dict[str, Any]] = []
-    # A full collection looks at all objects of the build, for tenths of a second, in which no command is sent.
-    gc.collect()
-    gc.freeze()
-    try:
-        with Connection(endpoint, name="demo") as connection, Tool(connection, tool.name) as moved:
-            index = connection.description.index(tool.name)
-            connection.on_force(lambda message, arrival_ns: messages.append(message))
-            for i in steps(seconds, model.period_s):
-                moved.move(path[i].tolist(), velocity[i].tolist())
-            status = connection.next_status(_STATUS_WAIT_S)
-    finally:
-        gc.unfreeze()
-    client = moved.contract.summary()
-    progress.note(f"{client['commands_answered']:,} of {client['commands_sent']:,} commands answered")
-    if len(messages) < 2 or status is None:
-        raise ValueError(f"{len(messages)} ticks received, expected at least 2 and a status")
+    sent = _moved(model, endpoint, surface_path(model, seconds), progress)
+    felt, scale = _felt(sent, model.period_s)
 
     progress("full model")
-    over_wire = {name: np.array([message[name][index] for message in messages]) for name in _FIELDS}
-    received = np.array([message["tick"] for message in messages])
-    received -= received[0]
-    # Force messages may be lost: the position of such a tick is interpolated.
-    ticks = np.arange(received[-1] + 1)
-    position = np.stack([np.interp(ticks, received, x) for x in over_wire["position_m"].T], axis=1)
-    scale = np.interp(ticks, received, over_wire["force_scale"])
-    near = np.flatnonzero(cKDTree(position).query(model.points)[0] < _NEAR * tool.radius_m)
+    near = np.flatnonzero(cKDTree(felt.position_m).query(model.points)[0] < _NEAR * tool.radius_m)
     full_model = reference(near)
-    stiffness = status["tools"][tool.name]["stiffness_n_per_m"]
     # The server lifts a tool whose commands stay away, until they come again.
-    felt, displacement = replayed(model, position, stiffness, scale > 0)
-    full, _ = replayed(full_model, position, stiffness, scale > 0)
+    full = replayed(full_model, felt.position_m, sent.stiffness_n_per_m, scale > 0)
     full = replace(full, force_n=scale[:, None] * full.force_n)
-    for name in ("force_n", "normal"):
-        getattr(felt, name)[received] = over_wire[name]
     progress.note(f"{len(near)} points, {full_model.n_modes:,} modes and Ritz modes")
     difference = felt.force_n - full.force_n
     largest = float(np.linalg.norm(full.force_n, axis=1).max())
@@ -131,7 +135,84 @@ def slide(
         float(np.linalg.norm(d, axis=1).max() / largest)
         for d in (difference, in_band(difference, model.band_hz, model.period_s))
     )
-    return Slide(model, client, felt, full, displacement, error, within_band)
+    lost = len(felt.time_s) - len(sent.forces)
+    return Slide(model, sent.client, felt, full, sent.displacement_m(), lost, error, within_band)
+
+
+@dataclass(frozen=True)
+class _Sent:
+    """What the server sent during a motion.
+
+    forces, surfaces   messages, in the order of their ticks
+    index              of the tool in the lists of a force message
+    stiffness_n_per_m  of the tool's spring
+    client             summary of the contract
+    """
+
+    forces: list[dict[str, Any]]
+    surfaces: list[Surface]
+    index: int
+    stiffness_n_per_m: float
+    client: dict[str, Any]
+
+    def displacement_m(self) -> Array:
+        """(n_points, 3), of the surface nearest to halfway."""
+        halfway = (self.forces[0]["tick"] + self.forces[-1]["tick"]) / 2
+        nearest = min(self.surfaces, key=lambda surface: abs(surface.tick - halfway))
+        return np.array(nearest.displacement_m, np.float64).reshape(-1, 3)
+
+
+def _moved(model: SurfaceModel, endpoint: str, path: Array, progress: Progress) -> _Sent:
+    """Have the server move the first tool along a path (n_ticks, 3), m. Errors as `slide`."""
+    name, velocity = model.tools[0].name, np.asarray(np.gradient(path, model.period_s, axis=0))
+    forces: list[dict[str, Any]] = []
+    surfaces: list[Surface] = []
+    # A full collection looks at all objects of the build, for tenths of a second, in which no command is sent.
+    gc.collect()
+    gc.freeze()
+    try:
+        with Connection(endpoint, name="demo") as connection, Tool(connection, name) as moved:
+            index = connection.description.index(name)
+            connection.on_force(lambda message, arrival_ns: forces.append(message))
+            connection.on_surface(surfaces.append)
+            for i in steps(len(path) * model.period_s, model.period_s):
+                moved.move(path[i].tolist(), velocity[i].tolist())
+            status = connection.next_status(_STATUS_WAIT_S)
+    finally:
+        gc.unfreeze()
+    client = moved.contract.summary()
+    progress.note(f"{client['commands_answered']:,} of {client['commands_sent']:,} commands answered")
+    if len(forces) < 2 or not surfaces or status is None:
+        raise ValueError(
+            f"{len(forces)} ticks and {len(surfaces)} surfaces received, expected at least 2, 1 and a status"
+        )
+    return _Sent(forces, surfaces, index, status["tools"][name]["stiffness_n_per_m"], client)
+
+
+def _felt(sent: _Sent, period_s: float) -> tuple[Felt, Array]:
+    """What came over the wire, at every tick, and the scale of the force (n_ticks,). Lost ticks are interpolated."""
+    received = np.array([message["tick"] for message in sent.forces])
+    ticks = np.arange(received[0], received[-1] + 1)
+
+    def at_every_tick(values: Iterable[Any]) -> Array:
+        columns = np.array(list(values), np.float64).reshape(len(received), -1).T
+        return np.stack([np.interp(ticks, received, column) for column in columns], axis=1)
+
+    of_tool = {
+        name: at_every_tick(message[name][sent.index] for message in sent.forces) for name in _PER_TOOL
+    }
+    tissue = at_every_tick((m["tissue_stored_j"], m["tissue_dissipated_j"]) for m in sent.forces)
+    felt = Felt(
+        time_s=(ticks - ticks[0]) * period_s,
+        position_m=of_tool["position_m"],
+        force_n=of_tool["force_n"],
+        normal=of_tool["normal"],
+        n_points=of_tool["n_contact_points"][:, 0].astype(int),
+        work_j=of_tool["work_j"][:, 0],
+        stored_j=tissue[:, 0] + of_tool["stored_j"][:, 0],
+        dissipated_j=tissue[:, 1] + of_tool["dissipated_j"][:, 0],
+    )
+    return felt, of_tool["force_scale"][:, 0]
 
 
 def surface_path(model: SurfaceModel, seconds: float) -> Array:
@@ -169,13 +250,13 @@ def replayed(
     position_m: Array,
     stiffness_n_per_m: float,
     touching: NDArray[np.bool_] | None = None,
-) -> tuple[Felt, Array]:
-    """What the first tool feels at positions (n_ticks, 3), one a tick, and the displacement, (n_points, 3), halfway.
+) -> Felt:
+    """What the first tool feels in process, at positions (n_ticks, 3), one a tick.
 
     touching  (n_ticks,): whether the tool may touch; always if left out
     """
     simulation, name = Simulation(model, stiffness_n_per_m), model.tools[0].name
-    rows, displacement, work, spring, lost = [], np.zeros_like(model.points), 0.0, 0.0, 0.0
+    rows, work, spring, lost = [], 0.0, 0.0, 0.0
     for i, position in enumerate(position_m):
         force, normal, n_points = np.zeros(3), np.zeros(3), 0
         if touching is None or touching[i]:
@@ -186,10 +267,8 @@ def replayed(
             simulation.step({})
         stored, dissipated = simulation.energy()
         rows.append((*force, *normal, n_points, work, stored + spring, dissipated + lost))
-        if i == len(position_m) // 2:
-            displacement = simulation.positions() - model.points
     columns = np.array(rows).T
-    felt = Felt(
+    return Felt(
         time_s=np.arange(len(position_m), dtype=np.float64) * model.period_s,
         position_m=position_m,
         force_n=columns[:3].T.copy(),
@@ -199,4 +278,3 @@ def replayed(
         stored_j=columns[8],
         dissipated_j=columns[9],
     )
-    return felt, displacement
