@@ -21,31 +21,7 @@ if TYPE_CHECKING:
 
 def build() -> None:
     """Build a scene into a model file and say how accurate it is."""
-    parser = argparse.ArgumentParser(description=build.__doc__)
-    parser.add_argument("scene", type=Path, help="a TOML file such as configs/liver.toml")
-    parser.add_argument(
-        "--output", "-o", type=Path, metavar="FILE.npz", help="(default: NAME.npz of the scene)"
-    )
-    parser.add_argument(
-        "--method",
-        help="of the reduction: passive, tbr, tbr-band, hankel-optimal, modal or modal-static (default: the scene's)",
-    )
-    stop = parser.add_mutually_exclusive_group()
-    stop.add_argument("--order", type=int, help="number of states of the reduced model")
-    stop.add_argument(
-        "--tolerance", help="largest relative force error in the haptic band, such as 0.02 or 2%%"
-    )
-    parser.add_argument(
-        "--dry-run",
-        action="store_true",
-        help="say how many nodes, how much time and memory, and build nothing",
-    )
-    add_cache_options(parser)
-    parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")
-    parser.add_argument(
-        "--json", action="store_true", help="the report as JSON; progress goes to standard error"
-    )
-    options = parser.parse_args()
+    options = _build_options()
 
     with interrupts.ends_at_once():
         from palpate.files import check_output
@@ -85,6 +61,34 @@ def build() -> None:
         return
     print(accuracy_text(model, options.verbose))
     print(f"\nwrote {path} ({path.stat().st_size / 2**20:.1f} MiB) in {seconds:.0f} s")
+
+
+def _build_options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=build.__doc__)
+    parser.add_argument("scene", type=Path, help="a TOML file such as configs/liver.toml")
+    parser.add_argument(
+        "--output", "-o", type=Path, metavar="FILE.npz", help="(default: NAME.npz of the scene)"
+    )
+    parser.add_argument(
+        "--method",
+        help="of the reduction: passive, tbr, tbr-band, hankel-optimal, modal or modal-static (default: the scene's)",
+    )
+    stop = parser.add_mutually_exclusive_group()
+    stop.add_argument("--order", type=int, help="number of states of the reduced model")
+    stop.add_argument(
+        "--tolerance", help="largest relative force error in the haptic band, such as 0.02 or 2%%"
+    )
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="say how many nodes, how much time and memory, and build nothing",
+    )
+    add_cache_options(parser)
+    parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")
+    parser.add_argument(
+        "--json", action="store_true", help="the report as JSON; progress goes to standard error"
+    )
+    return parser.parse_args()
 
 
 def add_cache_options(parser: argparse.ArgumentParser) -> None:
