@@ -155,7 +155,7 @@ def plot_modes(full: FullModel, config: Config, count: int = 4) -> Figure:
 def plot_error_map(model: SurfaceModel) -> Figure:
     """The error of the force in the band over the surface, in percent: at each point that of the nearest one where it was measured.
 
-    It is 100 % where the points are too far apart to carry the smallest tool, and 0 at held points.
+    It is more where the points are too far apart for the smallest tool, and 0 at held points.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize

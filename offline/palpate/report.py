@@ -6,7 +6,7 @@ import numpy as np
 
 from palpate.model_file import Contact, ReducedModel, SurfaceModel
 from palpate.model_file.advice import NOTABLE_ERROR, force_advice, percent
-from palpate.model_file.contact_size import carried_share, point_spacings
+from palpate.model_file.contact_size import blunted_radius_m, carried_share
 from palpate.model_file.surface_model import SAMPLE_SIZE
 
 GOOD_ERROR = 0.05  # below what a hand tells apart: from about 7 % of a force (Pang, Tan & Durlach 1991)
@@ -123,7 +123,7 @@ def _surface_text(model: SurfaceModel, verbose: bool) -> str:
         ("force while moving", f"wrong by at most {percent(accuracy.error_in_working_area)}", f"motions of {low:g} to {high:g} Hz, at the worst sampled point of the working areas"),
         ("", f"wrong by at most {percent(accuracy.error_in_band)}", f"at the worst sampled point of all; median {percent(accuracy.error_in_band_median)}"),
         ("force at rest", f"wrong by {percent(accuracy.error_static)}", f"at the worst sampled point of all; median {percent(accuracy.error_static_median)}"),
-        ("surface", f"{percent(carried)} carries the tip", _elsewhere(model, carried, radius)),
+        ("points", f"near enough on {percent(carried)}", _elsewhere(model, carried, radius)),
         ("mesh", f"carries waves up to {accuracy.resolved_frequency_hz:.3g} Hz", "where it is coarsest"),
         ("energy", "never given out" if accuracy.is_passive else "can be given out", f"passivity margin {accuracy.passivity_margin:.1g}, sampled {accuracy.passivity_margin_sampled:.1g}"),
         ("largest stiffness", f"{accuracy.largest_stiffness_n_per_m:.3g} N/m", "in one tick, what a device can meet without a virtual coupling"),
@@ -149,9 +149,9 @@ def _surface_text(model: SurfaceModel, verbose: bool) -> str:
 def _elsewhere(model: SurfaceModel, carried: float, radius_m: float) -> str:
     """What is to be said of the rest of the surface."""
     if carried == 1:
-        return f"of {1e3 * radius_m:g} mm"
-    spacing = float(point_spacings(model.points, model.triangles).max())
-    return f"of {1e3 * radius_m:g} mm; elsewhere points are up to {1e3 * spacing:.2g} mm apart: not to be touched"
+        return f"for a tip of {1e3 * radius_m:g} mm"
+    largest = float(blunted_radius_m(model.points, model.triangles, radius_m).max())
+    return f"for a tip of {1e3 * radius_m:g} mm; elsewhere it acts as a blunter one, of up to {1e3 * largest:.2g} mm"
 
 
 def _surface_verdict(model: SurfaceModel) -> str:

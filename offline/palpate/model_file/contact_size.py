@@ -15,6 +15,9 @@ DEPTH = 0.5
 FEWEST_POINTS = 3.0
 """Points in contact that a tool needs."""
 
+_BLUNT = 0.02
+"""A sphere that is blunter by this meets 1 % more force: no more than an error of the model."""
+
 
 def contact_radius_m(tool_radius_m: float) -> float:
     """Radius of the contact of a sphere that is pressed in by half its radius, m."""
@@ -31,43 +34,44 @@ def smallest_radius_m(spacing_m: Floats) -> Floats:
     return spacing_m * math.sqrt(FEWEST_POINTS / points_in_contact(1.0, 1.0))
 
 
-def vertex_areas(points: Floats, triangles: NDArray[np.int32]) -> Floats:
-    """(n_points,), m²: a third of the triangles at each point, (n_points, 3), m; triangles (n_triangles, 3)."""
-    a, b, c = points[triangles.T]
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    return np.asarray(np.bincount(triangles.ravel(), np.repeat(areas / 3, 3), len(points)), np.float64)
+def point_areas(points: Floats, triangles: NDArray[np.int32]) -> Floats:
+    """(n_points,), m²: a third of the triangles around each point, (n_points, 3), m; triangles (n_triangles, 3)."""
+    corners = points[triangles]
+    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return np.asarray(np.bincount(triangles.ravel(), np.repeat(doubled / 6, 3), len(points)), np.float64)
 
 
-def point_spacings(points: Floats, triangles: NDArray[np.int32]) -> Floats:
-    """(n_points,), m: a point and its neighbors stand for spacing² each on average. Arguments as of `vertex_areas`."""
-    areas, n = vertex_areas(points, triangles), len(points)
-    first, second = triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()
-    total = areas.copy()
-    count = np.ones(n)
-    for here, there in ((first, second), (second, first)):
-        total += np.bincount(here, areas[there], n)
-        count += np.bincount(here, minlength=n)
-    spacings: Floats = np.sqrt(total / count)
-    return spacings
+def point_spacing(points: Floats, triangles: NDArray[np.int32]) -> Floats:
+    """(n_points,), m: root of the area that each point stands for. Arguments as of `point_areas`."""
+    return np.sqrt(point_areas(points, triangles))
 
 
-def carries(spacings_m: Floats, tool_radius_m: float) -> NDArray[np.bool_]:
-    """(n_points,): whether points so far apart carry a tool. Where they don't, its force is not that of the tissue."""
-    return smallest_radius_m(spacings_m) <= tool_radius_m
+def blunted_radius_m(points: Floats, triangles: NDArray[np.int32], radius_m: float) -> Floats:
+    """(n_points,), m: of the sphere as which a tool acts at each point, blunter where points are too far apart for its own."""
+    return np.maximum(smallest_radius_m(point_spacing(points, triangles)), radius_m)
 
 
-def carried_share(points: Floats, triangles: NDArray[np.int32], tool_radius_m: float) -> float:
-    """The share of the surface's area with points that carry a tool. Arguments as of `vertex_areas`."""
-    areas = vertex_areas(points, triangles)
-    carried = carries(point_spacings(points, triangles), tool_radius_m)
+def blunted_error(points: Floats, triangles: NDArray[np.int32], radius_m: float) -> Floats:
+    """(n_points,): by how much more force, relative, the blunter sphere meets at a depth: sqrt of the radii (Hertz 1882)."""
+    return np.sqrt(blunted_radius_m(points, triangles, radius_m) / radius_m) - 1
+
+
+def carried_share(points: Floats, triangles: NDArray[np.int32], radius_m: float) -> float:
+    """The share of the surface's area whose points are near enough for a tool. Arguments as of `point_areas`."""
+    areas = point_areas(points, triangles)
+    carried = blunted_radius_m(points, triangles, radius_m) <= radius_m * (1 + _BLUNT)
     return 1.0 if np.all(carried) else float(areas[carried].sum() / areas.sum())
 
 
-def coarse_advice(radius_m: float, share: float, spacing_m: float) -> str:
-    """A sentence for a tool that a share of the surface carries; elsewhere points are up to spacing_m apart."""
+def coarse_advice(points: Floats, triangles: NDArray[np.int32], radius_m: float) -> str | None:
+    """A sentence for a tool that acts as a blunter one on a part of the surface; else None. Arguments as of `point_areas`."""
+    share = carried_share(points, triangles, radius_m)
+    if share == 1:
+        return None
+    largest = float(blunted_radius_m(points, triangles, radius_m).max())
     return (
-        f"{100 * share:.2g} % of the surface has points that carry a tool with radius_m = {radius_m:g}; elsewhere they are up "
-        f"to {spacing_m:.2g} m apart, and its force is not that of the tissue"
+        f"the points of {100 * share:.2g} % of the surface are near enough for radius_m = {radius_m:g}; elsewhere it acts as a "
+        f"blunter one, of up to {largest:.2g} m"
     )
 
 

@@ -50,8 +50,8 @@ class SurfaceAccuracy:
     error_in_band             largest in the band over the sample, against the assembled body; before sampling in time
     error_in_band_median      the median over the sample
     error_in_working_area     the largest over the sample's points in the working areas, where tools are meant to touch
-    error_map                 (n_points,) float32: the error of the nearest point of the sample; 1 where the points are too far
-                              apart to carry the smallest tool; 0 at held points
+    error_map                 (n_points,) float32: the error of the nearest point of the sample; or, if it is more, by how much
+                              the force is too large where the tool acts as a blunter one (`contact_size`); 0 at held points
     passivity_margin          smallest eigenvalue, over the points and up to half the sampling rate, of the part of w C(jw) that
                               dissipates, over |w C(0)|; 0 or above to round-off, else no model is made
     passivity_margin_sampled  the same for the displacement in a tick under a force held over it, sampled for period_s

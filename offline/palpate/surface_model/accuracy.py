@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from palpate.discretization.resolution import resolved_frequency_hz
 from palpate.model_file import SurfaceAccuracy
-from palpate.model_file.contact_size import carries, contact_radius_m, point_spacings
+from palpate.model_file.contact_size import blunted_error, contact_radius_m
 from palpate.scene.schema import Config
 from palpate.surface_model import evidence
 from palpate.surface_model.flexibility import Flexible, SurfaceBody, Touched
@@ -61,6 +61,6 @@ def _error_map(
     """(n_points,), as in SurfaceAccuracy, from the errors of the sample and the radius of the smallest tool."""
     error_map = np.zeros(len(points), dtype=np.float32)
     _, nearest = cKDTree(points[sample]).query(points[touched.free])
-    carried = carries(point_spacings(points, touched.triangles)[touched.free], radius_m)
-    error_map[touched.free] = np.where(carried, errors[nearest], 1.0)
+    blunted = blunted_error(points, touched.triangles, radius_m)[touched.free]
+    error_map[touched.free] = np.maximum(errors[nearest], blunted)
     return error_map

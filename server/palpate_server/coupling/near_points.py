@@ -21,13 +21,6 @@ class TooManyPoints(ValueError):
         self.count = count
 
 
-def point_spacing(points: Floats, triangles: NDArray[np.int32]) -> Floats:
-    """(n_points,), m: root of the area that each point stands for, a third of the triangles around it."""
-    corners = points[triangles]
-    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return np.sqrt(np.bincount(triangles.ravel(), np.repeat(doubled / 6, 3), len(points)))
-
-
 def near_points(points: Floats, triangles: NDArray[np.int32], reach_m: Floats, most: int) -> Integers:
     """(n_points, k), k <= most: for each point those within reach, nearest first, itself included; NONE beyond them.
 

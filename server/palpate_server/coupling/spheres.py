@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.model_file import SurfaceAccuracy, SurfaceModel
-from palpate.model_file.contact_size import smallest_radius_m
+from palpate.model_file.contact_size import point_spacing, smallest_radius_m
 from palpate_server.bodies import elastic_surface
 from palpate_server.bodies.elastic_surface import NOBODY, ElasticSurface
 from palpate_server.coupling import contact_solver
 from palpate_server.coupling.contact_solver import Rows
-from palpate_server.coupling.near_points import TooManyPoints, near_points, point_spacing
+from palpate_server.coupling.near_points import TooManyPoints, near_points
 from palpate_server.coupling.tracking import Tracking
 from palpate_server.realtime.compiled import compiled
 

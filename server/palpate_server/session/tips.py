@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from palpate.model_file import ReducedModel, SurfaceModel
-from palpate.model_file.contact_size import carried_share, coarse_advice, point_spacings, small_tool_advice
+from palpate.model_file.contact_size import coarse_advice, point_spacing, small_tool_advice
 from palpate_server.coupling import models
 from palpate_server.coupling.models import Model
 from palpate_server.coupling.running import Tip
@@ -84,9 +84,9 @@ def tip_warnings(model: Model, tool: int, tip: Tip | None) -> list[str]:
     """Where the points of a surface model are too far apart for a tip, by the index of its tool: at its start, or elsewhere."""
     if not isinstance(model, SurfaceModel) or tip is None:
         return []
-    spacings = point_spacings(model.points, model.triangles)
     nearest = int(np.argmin(np.linalg.norm(model.points - tip.start_m, axis=1)))
-    if at_start := small_tool_advice(model.tools[tool].name, tip.radius_m, float(spacings[nearest])):
-        return [at_start]
-    share = carried_share(model.points, model.triangles, tip.radius_m)
-    return [] if share == 1 else [coarse_advice(tip.radius_m, share, float(spacings.max()))]
+    spacing_m = float(point_spacing(model.points, model.triangles)[nearest])
+    text = small_tool_advice(model.tools[tool].name, tip.radius_m, spacing_m) or coarse_advice(
+        model.points, model.triangles, tip.radius_m
+    )
+    return [] if text is None else [text]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_server.coupling.near_points import NONE, TooManyPoints, near_points, point_spacing
+from palpate.model_file.contact_size import point_spacing
+from palpate_server.coupling.near_points import NONE, TooManyPoints, near_points
 
 # A strip of squares, 1 m wide, with one long one at its end.
 X = np.array([0.0, 1.0, 2.0, 3.0, 13.0])
