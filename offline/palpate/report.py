@@ -133,7 +133,7 @@ def _surface_text(model: SurfaceModel, verbose: bool) -> str:
         f"\n{model.name}: {model.n_points:,} points to touch, {model.n_modes:,} modes, tools {tools}",
         f"  errors are those of a tip of {1e3 * radius:g} mm radius, pressed in by half of it, at a sample of up to {SAMPLE_SIZE} points",
         *_columns(rows),
-        f"  verdict: {_surface_verdict(model)}",
+        f"  verdict: {_surface_verdict(model, carried == 1)}",
     ]
     figures = [
         ("nodes", f"{model.n_nodes:,}", ""),
@@ -154,16 +154,16 @@ def _elsewhere(model: SurfaceModel, carried: float, radius_m: float) -> str:
     return f"for a tip of {1e3 * radius_m:g} mm; elsewhere it acts as a blunter one, of up to {1e3 * largest:.2g} mm"
 
 
-def _surface_verdict(model: SurfaceModel) -> str:
-    accuracy = model.accuracy
+def _surface_verdict(model: SurfaceModel, everywhere: bool) -> str:
+    accuracy, where = model.accuracy, "" if everywhere else " in the working areas"
     worst = max(accuracy.error_in_working_area, accuracy.error_static)
     if worst > NOTABLE_ERROR:
-        return f"poor: the force is wrong by up to {percent(worst)} of itself; lower surface.tolerance"
+        return f"poor: the force is wrong by up to {percent(worst)} of itself{where}; lower surface.tolerance"
     carried = accuracy.resolved_frequency_hz
     mesh = "" if carried >= model.band_hz[1] else f"; the mesh limits it above {carried:.3g} Hz"
     if worst > GOOD_ERROR:
-        return f"fair: a trained hand may feel the error{mesh}"
-    return f"good: the error is below what a hand tells apart{mesh}"
+        return f"fair{where}: a trained hand may feel the error{mesh}"
+    return f"good{where}: the error is below what a hand tells apart{mesh}"
 
 
 def _details(figures: Rows, verbose: bool) -> list[str]:
