@@ -94,7 +94,7 @@ def press(body: FullBody, tip: Tip, positions_m: Floats, period_s: float) -> tup
         closing = np.einsum("pi,pi->p", unloaded - displacement, inward) - felt @ (device - center)
         rows = np.flatnonzero((gap + closing < _REACH_M) & (height > 0) & (depth > 0))
         load = np.zeros((len(near), 3))
-        reaction, drift = np.zeros(3), np.zeros(3)
+        reaction, drift = np.zeros(3), displacement[np.argmin(np.where(height > 0, gap, np.inf))]
         if len(rows):
             spring = felt[rows] @ felt[rows].T / tip.stiffness_n_per_m
             blocks = compliance.reshape(len(near), 3, len(near), 3)[rows][:, :, rows]
@@ -102,7 +102,8 @@ def press(body: FullBody, tip: Tip, positions_m: Floats, period_s: float) -> tup
             pressed = complementary(matrix, closing[rows] + gap[rows])
             load[rows] = pressed[:, None] * inward[rows]
             reaction = pressed @ felt[rows]
-            drift = pressed @ displacement[rows] / max(pressed.sum(), 1e-300)
+            if pressed.any():
+                drift = pressed @ displacement[rows] / pressed.sum()
         state = state + driven * (shapes.T @ load.ravel())
         displacement = (shapes @ state[0]).reshape(-1, 3)
         center = device - reaction / tip.stiffness_n_per_m

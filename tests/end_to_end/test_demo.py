@@ -112,6 +112,7 @@ def test_a_tool_presses_slides_and_lets_go_and_nothing_ever_pulls_it(tmp_path: P
     lines = "\n".join(slide.lines())
     assert "never a pull" in lines
     assert f"{1e3 * slide.felt.work_j[-1]:.3f} mJ of work by the tool = " in lines
-    # Beside the error that the file states: points of this coarse block get in touch some ticks earlier or later.
+    # Beside the error that the file states: while sliding begins, a point of the reference sticks and slips in alternate ticks,
+    # since nearly all of its compliance is in modes that are stepped. Without friction both agree within 0.3 %.
     assert slide.error_in_band < slide.model.accuracy.error_in_working_area + 0.05
     assert_is_a_picture(demo.picture)
