@@ -39,7 +39,8 @@ FRAME = {
 TIP = Contact("tip", (-0.02, -0.08, 0.03), (0.0, -1.0, 0.0), 0.005, 37)
 DEPTH_M, PRESSED_S = 0.0015, 0.5  # at the client: with its scale, 3 mm in the model
 MODEL_FIELDS = (
-    *("kind", "name", "order", "config_sha256", "static_stiffness_n_per_m", "instant_stiffness_n_per_m"),
+    *("kind", "name", "order", "config_sha256", "stiffness_factor"),
+    *("static_stiffness_n_per_m", "instant_stiffness_n_per_m"),
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -50,13 +51,15 @@ def tool_state(force: Force, tool: Mapping[str, Any]) -> ToolState:
 
     tool: its part of the status message: `frame` and `stiffness_n_per_m`, nil for a patch model.
 
-    The sphere of a surface model hangs on a spring at the device, so the spring's force says how far it is from the device. A
-    force that fades is a share `force_scale` of the spring's.
+    The sphere of a surface model hangs on a spring at the device. The spring's energy says how far the sphere is from the
+    device, and the force in which direction: its magnitude may be limited or fading, and its direction stays.
     """
     frame, stiffness = tool["frame"], tool["stiffness_n_per_m"]
     device = point_in_model(frame, force.position_m)
     force_n = force_in_model(frame, force.force_n)
-    if stiffness is None or force.force_scale <= 0:
+    newtons = math.hypot(*force.force_n)
+    if stiffness is None or newtons == 0:
         return ToolState(device, device, force_n)
-    spring = np.asarray(force.force_n, float) / (stiffness * force.force_scale)  # m, at the client
+    length_m = math.sqrt(2 * max(force.touch.stored_j, 0.0) / stiffness)  # at the client
+    spring = np.asarray(force.force_n, float) * (length_m / newtons)
     return ToolState(device, device + float(frame["scale"]) * direction_in_model(frame, spring), force_n)

@@ -85,6 +85,7 @@ class Hand:
         with self._lock:
             if self._grip is not None and self._grip.page == page:
                 self._grip = None
+                self._lock.notify()
 
     def end(self) -> None:
         """Let the tool go, and end the thread."""
@@ -153,4 +154,7 @@ class Hand:
             tool.move(motion.position_m.tolist(), motion.velocity_m_per_s.tolist())
             self.position_m, self.normal = motion.position_m, gesture.normal
             due_s = max(due_s + COMMAND_PERIOD_S, now_s)
-            time.sleep(max(0.0, due_s - time.monotonic()))
+            with self._lock:
+                self._lock.wait_for(
+                    lambda: self._grip is not grip, timeout=max(0.0, due_s - time.monotonic())
+                )

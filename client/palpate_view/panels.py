@@ -109,8 +109,9 @@ class Panels:
             self.color = gui.add_dropdown("Show", (DISPLACEMENT, NO_COLOR))
             self.legend = gui.add_html("")
         with gui.add_folder("Session"):
-            self.model = gui.add_text(
-                "Model file", "", hint="Name of a file in the server's folder of models"
+            self.model = gui.add_dropdown("Model", ("-",), hint="Of the server's folder of models")
+            self.stiffness = gui.add_slider(
+                "Stiffness, times the file's", 0.1, 10.0, 0.1, 1.0, visible=False, hint="Of all moduli"
             )
             self.load = gui.add_button("Load")
             self.record = gui.add_button(RECORD, icon=viser.Icon.PLAYER_RECORD)
@@ -126,6 +127,13 @@ class Panels:
     def draw_charts(self, columns: dict[str, NDArray[np.float64]]) -> None:
         for chart in self._charts:
             chart.draw(columns)
+
+    def fill_models(self, files: Sequence[str], running: str | None, stiffness_factor: float | None) -> None:
+        """Show the files that can be loaded, the one that runs, and its stiffness factor, None for patches."""
+        self.model.options = tuple(files) or ("-",)
+        _set(self.model, running if running in files else self.model.options[0])
+        self.stiffness.visible = stiffness_factor is not None
+        _set(self.stiffness, 1.0 if stiffness_factor is None else stiffness_factor)
 
     def fill(self, radii_m: dict[str, float], friction: float | None, *, has_error: bool) -> None:
         """Show what the tools of a model, by name, can be asked for. `friction` is the model's, None for patches."""

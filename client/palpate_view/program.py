@@ -74,24 +74,24 @@ class View:
     async def _opened(self, client: viser.ClientHandle) -> None:
         if client.camera.aspect < 1.0:  # on a phone the controls would cover the organ
             client.gui.main_panel.minimize()
-        if self.session is not None:
-            self.session.frame_organ(client)
+        if session := self.session:
+            session.frame_organ(client)
 
     async def _closed(self, client: viser.ClientHandle) -> None:
-        if self.session is not None:
-            self.session.page_closed(client.client_id)
+        if session := self.session:
+            session.page_closed(client.client_id)
 
     def _choose(self, _: Any) -> None:
-        if self.session is not None:
-            self.session.choose_tool(self.panels.tool.value)
+        if session := self.session:
+            session.choose_tool(self.panels.tool.value)
 
     def _load(self, _: Any) -> None:
-        if self.session is not None:
-            self.session.load(self.panels.model.value)
+        if session := self.session:
+            session.load(self.panels.model.value, self.panels.stiffness.value)
 
     def _record(self, _: Any) -> None:
-        if self.session is not None:
-            self.session.record()
+        if session := self.session:
+            session.record()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

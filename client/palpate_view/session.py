@@ -30,6 +30,7 @@ PULSE_S = 0.1  # pause between two questions to the page that drags
 _PULSE_TIMEOUT_S = LONGEST_SILENCE_S
 _SMALLEST_SCALE_M = 1e-3
 _SCALE_HALF_LIFE_S = 4.0  # of the colors' largest value, after the tissue has moved less
+_IDENTITY = ("config_sha256", "stiffness_factor")
 _PATCH_SPHERE = 0.4  # of the patch's radius: of the sphere that is drawn for its tool
 
 
@@ -54,7 +55,6 @@ class Session:
         self._model = description.message["model"]
         self._anywhere = self._model.get("kind") == "surface"
         self._watch = Watch(connection, description.tools[0].name)
-        self._hand = Hand(connection, tell)
         self._axis = np.asarray(description.tools[0].normal, float)  # of the tool's shaft
         self._largest_m = _SMALLEST_SCALE_M
         page.scene.reset()
@@ -64,13 +64,19 @@ class Session:
         self._scene = Scene(page.scene, *surface_at_rest(geometry))
         error = geometry.error_in_band
         self._error = None if error is None else np.frombuffer(error, np.float32)
-        self._scene.on_drag(self._on_organ, self._on_tool)
         described = description.message["tools"]
         panels.fill(
             {tool["name"]: tool["radius_m"] for tool in described},
             described[0]["friction"] if self._anywhere else None,
             has_error=self._error is not None,
         )
+        panels.fill_models(
+            description.message["model_files"],
+            description.message["model_file"],
+            self._model["stiffness_factor"] if self._anywhere else None,
+        )
+        self._hand = Hand(connection, tell)  # its thread is ended by `run`
+        self._scene.on_drag(self._on_organ, self._on_tool)
         for client in page.get_clients().values():
             self.frame_organ(client)
 
@@ -81,7 +87,7 @@ class Session:
             while not stop.wait(FRAME_PERIOD_S):
                 self._connection.check()
                 status = self._connection.status
-                if status and status["model"]["config_sha256"] != self._model["config_sha256"]:
+                if status and any(status["model"][key] != self._model[key] for key in _IDENTITY):
                     return
                 if not self._page.get_clients():
                     self._watch.end()
@@ -201,6 +207,7 @@ class Session:
         return [
             ("model", html.escape(str(self._model["name"]))),
             ("kind, order", f"{self._model.get('kind', 'patch')}, {self._model['order']}"),
+            *([("stiffness factor", f"{self._model['stiffness_factor']:g}")] if self._anywhere else ()),
             ("tick lateness, p50, p99", times("tick_lateness_s")),
             ("compute time, p50, p99", times("compute_time_s")),
             ("faults, skipped ticks", f"{status['faults']}, {status['skipped_ticks']}"),
@@ -317,12 +324,15 @@ class Session:
         if name in self._tools and name != self._watch.tool:
             self._watch.watch_tool(name)
 
-    def load(self, file: str) -> None:
-        """Have the server run another model of its folder; `run` sees it."""
+    def load(self, file: str, stiffness_factor: float) -> None:
+        """Have the server run a model of its folder, that many times as stiff; `run` sees it."""
         try:
             with Tool(self._connection, self._watch.tool):
-                answer = self._connection.control("load", file=file)
-            self._tell(f"The server runs {answer['model']['name']}.")
+                answer = self._connection.control("load", file=file, stiffness_factor=stiffness_factor)
+            factor = answer["model"]["stiffness_factor"]
+            self._tell(
+                f"The server runs {answer['model']['name']}{'' if factor == 1 else f', {factor:g} times as stiff'}."
+            )
         except (ClientError, RuntimeError) as error:
             self._tell(str(error))
 

@@ -98,6 +98,7 @@ def _server_options(options: argparse.Namespace) -> ServerOptions:
         options.black_box,
         options.surface_hz,
         options.cpu,
+        options.model.name if options.model.resolve().parent == models.resolve() else None,
     )
 
 

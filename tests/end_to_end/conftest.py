@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -204,6 +205,21 @@ def run_example(start: Callable[..., Program]) -> Callable[..., Program]:
         return start(*what, *place, *patient, *options)
 
     return run
+
+
+@pytest.fixture
+def view(start: Callable[..., Program]) -> Callable[[str], str]:
+    """view(endpoint of a server) -> address of the page that `palpate view` serves"""
+
+    def view(endpoint: str) -> str:
+        port = free_endpoint().rpartition(":")[2]
+        options = ("--connect", endpoint, "--session", SESSION, "--port", port)
+        program = start("-m", "palpate", "view", *options, ready="palpate view:")
+        found = re.search(r"http://\S+", program.out.read_text())
+        assert found is not None
+        return found[0]
+
+    return view
 
 
 @pytest.fixture(name="wait_for")

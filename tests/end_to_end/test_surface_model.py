@@ -343,6 +343,47 @@ def test_models_of_both_kinds_are_loaded_in_turns_while_the_tool_presses_and_all
     assert np.linalg.norm(np.diff(recorded.ports["force_n"][:, 0], axis=0), axis=1).max() < 0.02 * limit
 
 
+def test_a_model_is_loaded_anew_three_times_as_stiff_and_all_is_repeated(
+    serve: Callable[..., Any],
+    connect: Callable[..., Any],
+    make_surface_model: Callable[..., SurfaceModel],
+    tmp_path: Path,
+) -> None:
+    model = make_surface_model()
+    served = serve("--recordings", str(tmp_path), model=model)
+
+    def settled(client: Any) -> tuple[float, float]:
+        """Force, N, and depth of the tip, m, when the tissue has relaxed."""
+
+        def is_still(force: dict[str, Any]) -> bool:
+            before = client.forces[max(0, len(client.forces) - 300)]
+            moved = abs(force["penetration_m"][0] - before["penetration_m"][0])
+            return force["tick"] > before["tick"] + 200 and bool(moved < 5e-7)
+
+        force = client.force_when(is_still, "relaxed tissue")
+        return force["force_n"][0][2], force["penetration_m"][0]
+
+    with connect(served.endpoint) as client:
+        described = client.query("describe")[1]
+        assert described["model_file"] in described["model_files"]
+        x, y, z = client.acquire("tip")[1]["tools"]["tip"]["home_m"]
+        with client.pressing({"tip": [x, y, z - 3e-3]}):
+            client.force_when(lambda force: force["force_n"][0][2] > 0.05, "a force")
+            soft_n, soft_m = settled(client)
+            client.record("a.mcap")
+            granted, answer = client.control("load", file=described["model_file"], stiffness_factor=3)
+            assert granted and answer["model"]["stiffness_factor"] == 3.0, answer
+            client.status_when(lambda status: status["model"]["stiffness_factor"] == 3.0, "the factor")
+            stiff_n, stiff_m = settled(client)
+            assert client.control("record", file=None)[0]
+        assert client.query("describe")[1]["model"]["band_hz"][1] == pytest.approx(model.band_hz[1] * 3**0.5)
+        for wrong in ("3", 0.01, -1, float("nan")):
+            assert not client.control("load", file=described["model_file"], stiffness_factor=wrong)[0]
+    # Hertz: the spring of the tool takes some of the depth away from the stiffer tissue. Over the points it is not quite 3/2.
+    assert stiff_n / soft_n == pytest.approx(3 * (stiff_m / soft_m) ** 1.5, rel=0.05)
+    assert_all_is_repeated(tmp_path / "a.mcap", model)
+
+
 @pytest.mark.slow
 def test_what_a_stiffer_model_gives_a_hand_that_pressed_a_soft_one_is_counted_apart(
     serve: Callable[..., Any],

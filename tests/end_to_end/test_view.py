@@ -6,7 +6,6 @@ It needs Chromium, such as Debian's packages `chromium` and `fonts-dejavu-core`.
 from __future__ import annotations
 
 import math
-import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -56,19 +55,6 @@ def browser() -> Iterator[Any]:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*SWIFTSHADER, *NO_NETWORK])
         yield browser
         browser.close()
-
-
-@pytest.fixture
-def view(start: Callable[..., Any]) -> Callable[[str], str]:
-    """view(endpoint of a server) -> address of the page"""
-
-    def view(endpoint: str) -> str:
-        port = free_endpoint().rpartition(":")[2]
-        options = ("--connect", endpoint, "--session", "test", "--port", port)
-        program = start("-m", "palpate", "view", *options, ready="palpate view:")
-        return str(re.search(r"http://\S+", program.out.read_text())[0])  # type: ignore[index]
-
-    return view
 
 
 def opened(browser: Any, address: str, **options: Any) -> Any:

@@ -13,7 +13,7 @@ import skfem
 from skfem.helpers import ddot, eye, sym_grad, trace
 
 from palpate.build_surface import build_surface_model
-from palpate.model_file import SurfaceModel, load_model, save_model
+from palpate.model_file import SurfaceModel, load_model, save_model, stiffened
 from palpate.model_file.contact_size import blunted_error
 from palpate.report import accuracy_text
 from palpate.scene.schema import check_config
@@ -181,6 +181,22 @@ def test_another_prony_series_changes_nothing_but_itself() -> None:
     np.testing.assert_array_equal(one.residual, other.residual)
     np.testing.assert_array_equal(one.shapes, other.shapes)
     assert other.gamma.tolist() == [2.0]
+
+
+def test_the_model_of_a_body_that_is_three_times_as_stiff_is_the_stiffened_one() -> None:
+    small = SCENE | {"geometry": SCENE["geometry"] | {"counts": [5, 5, 4]}}
+    soft_pa = PRESETS["liver"].youngs_modulus_pa
+    stiff = small | {"material": {"preset": "liver", "youngs_modulus_pa": 3 * soft_pa}}
+    one, other = (build_surface_model(check_config(s, "block"), Path()) for s in (small, stiff))
+    made = stiffened(one, 3.0)
+    np.testing.assert_allclose(made.squared_frequencies, other.squared_frequencies, rtol=1e-7)
+    # Of two modes of one frequency each mixture is right; the compliance of all modes together is one.
+    compliance, expected = (
+        np.einsum("pck,qdk,k->pcqd", m.shapes, m.shapes, 1 / m.squared_frequencies) for m in (made, other)
+    )
+    np.testing.assert_allclose(compliance, expected, atol=1e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(made.residual, other.residual, atol=1e-5 * np.abs(other.residual).max())
+    assert made.band_hz == (0.0, pytest.approx(15.0 * 3**0.5)) and made.stiffness_factor == 3.0
 
 
 def test_a_tool_that_is_too_small_for_the_points_is_warned_of_with_its_number() -> None:

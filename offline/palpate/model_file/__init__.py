@@ -5,7 +5,7 @@ The package needs numpy and the standard library only, so that a server can load
 
 from palpate.lti.pole_residue import PoleResidueSystem
 from palpate.model_file.read import load_model, load_patch_model
-from palpate.model_file.surface_model import SurfaceAccuracy, SurfaceModel, ToolShape
+from palpate.model_file.surface_model import SurfaceAccuracy, SurfaceModel, ToolShape, stiffened
 from palpate.model_file.types import (
     LONGEST_PERIOD_S,
     SHORTEST_PERIOD_S,
@@ -34,4 +34,5 @@ __all__ = [
     "load_model",
     "load_patch_model",
     "save_model",
+    "stiffened",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -105,6 +105,7 @@ class SurfaceModel:
     shapes               (n_points, 3, n_modes), phi_k, mass-normalized, kg^-1/2
     residual             (3 n_points, 3 n_points), R, m/N, symmetric and positive semidefinite
     gamma, tau_s         (n_terms,), the Prony series, relative to the relaxed modulus
+    stiffness_factor     of all moduli, over those of the file, where it is 1; see `stiffened`
     """
 
     kind: ClassVar[str] = "surface"
@@ -127,6 +128,7 @@ class SurfaceModel:
     config_sha256: str
     built_with: str
     accuracy: SurfaceAccuracy
+    stiffness_factor: float = 1.0
 
     @property
     def order(self) -> int:
@@ -167,3 +169,20 @@ class SurfaceModel:
             "n_held_points": int(np.count_nonzero(self.held)),
             "n_triangles": len(self.triangles),
         }
+
+
+def stiffened(model: SurfaceModel, factor: float) -> SurfaceModel:
+    """The model of the same body with all moduli times a factor above 0.
+
+    The modes stay, omega² grows and R shrinks by the factor: exact, because all stiffness is proportional to the modulus and
+    the mass is not. The band scales with the frequencies. `accuracy` stays as it was measured: at rest it is that of every
+    factor; in the band it is nearly so, since the Prony series keeps its times.
+    """
+    root = factor**0.5
+    return replace(
+        model,
+        squared_frequencies=model.squared_frequencies * factor,
+        residual=model.residual / np.float32(factor),
+        band_hz=(model.band_hz[0] * root, model.band_hz[1] * root),
+        stiffness_factor=model.stiffness_factor * factor,
+    )

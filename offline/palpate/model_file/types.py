@@ -162,6 +162,7 @@ class ReducedModel:
     """
 
     kind: ClassVar[str] = "patch"
+    stiffness_factor: ClassVar[float] = 1.0  # only a surface model can be made stiffer
 
     name: str
     method: str

@@ -34,7 +34,7 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader
 
 from palpate.files import printable
-from palpate.model_file import ModelFileError, load_model
+from palpate.model_file import ModelFileError, SurfaceModel, load_model, stiffened
 from palpate_client.arguments import failed
 from palpate_client.wire import Flags
 from palpate_server.coupling import cross_fade, models
@@ -215,7 +215,7 @@ def _restored(
     saved = snapshot.from_message(message)
     found = []
     for told in (message["model"], message["following"]):
-        model = next((m for m in at_hand if snapshot.identity(m) == told), None)
+        model = None if told is None else _model_of(told, at_hand)
         if told is not None and model is None:
             missing[
                 f"{told['name']!r} (order {told['order']}, config_sha256 {told['config_sha256'][:12]})"
@@ -235,6 +235,16 @@ def _restored(
         memory = memory._replace(ring=before.ring)
     _restore(memory, saved)
     return memory
+
+
+def _model_of(told: dict[str, Any], at_hand: Sequence[Model]) -> Model | None:
+    """The model of an identity, as stiff as it was; None when it is not at hand."""
+    factor = told.get("stiffness_factor", 1.0)  # earlier recordings do not tell it
+    told = told | {"stiffness_factor": factor}
+    for model in at_hand:
+        if snapshot.identity(model) | {"stiffness_factor": factor} == told:
+            return stiffened(model, factor) if isinstance(model, SurfaceModel) and factor != 1 else model
+    return None
 
 
 def _restore(memory: Memory, saved: Saved) -> None:

@@ -19,6 +19,7 @@ def identity(model: Model) -> dict[str, Any]:
         "kind": model.kind,
         "order": model.order,
         "config_sha256": model.config_sha256,
+        "stiffness_factor": model.stiffness_factor,
     }
 
 

@@ -29,6 +29,7 @@ FARTHEST_ORIGIN_M = 10.0
 LONGEST_ROUND_TRIP_S = 1.0
 MOST_DEVICE_DAMPING_N_S_PER_M = 1e3
 LEAST_STIFFNESS_N_PER_M, MOST_STIFFNESS_N_PER_M = 1.0, 1e5
+SOFTEST, STIFFEST = 0.1, 10.0
 _ORTHONORMAL = 1e-6
 
 
@@ -146,6 +147,11 @@ def tip_in(request: dict[str, Any]) -> TipWanted:
         _optional_number(request, "friction", 0.0, MOST_FRICTION),
         _optional_number(request, "stiffness_n_per_m", LEAST_STIFFNESS_N_PER_M, MOST_STIFFNESS_N_PER_M),
     )
+
+
+def stiffness_factor_in(request: dict[str, Any]) -> float:
+    factor = _optional_number(request, "stiffness_factor", SOFTEST, STIFFEST)
+    return 1.0 if factor is None else factor
 
 
 def limits_in(request: dict[str, Any], known: tuple[str, ...]) -> dict[str, float]:

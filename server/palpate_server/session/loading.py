@@ -26,6 +26,7 @@ from palpate_server.session.tips import tip_warnings, tips_for
 log = logging.getLogger("palpate_server")
 
 CROSS_FADE_S = 0.5  # from one model to another
+_MOST_FILES = 100
 
 
 class ModelLoader:
@@ -35,19 +36,20 @@ class ModelLoader:
         self._state = state
         self._folder = folder
 
-    def load(self, client: str, file: object) -> dict[str, Any]:
-        """Check a model file, cross-fade to its model, and drop the old one. Raises Refused."""
+    def load(self, client: str, file: object, stiffness_factor: float) -> dict[str, Any]:
+        """Check a model file, cross-fade to its model with its moduli times a factor, and drop the old one. Raises Refused."""
         state = self._state
         if not state.exchanging.acquire(blocking=False):
             raise Refused("busy", "another model is being loaded, or a tool acquired")
         try:
             state.check_alone(client)
-            model = self._read(file)
+            model = self._read(file, stiffness_factor)
             tips = self._tips(model)
             memory = self._fade_to(model, list(tips.values()))
             with state.model_in_use:
                 self._end_exchange(memory, model)
                 state.tips = tips
+            state.model_file = str(file)
             log.info("now serving %s (order %d)", model.name, model.order)
             for warning in accuracy_warnings(model):
                 log.warning("%s", warning)
@@ -99,7 +101,7 @@ class ModelLoader:
                 if error.reason != "busy":
                     raise
 
-    def _read(self, name: object) -> Model:
+    def _read(self, name: object, stiffness_factor: float) -> Model:
         if not is_plain_name(name):
             raise Refused(
                 "bad_model",
@@ -110,7 +112,7 @@ class ModelLoader:
         try:
             if path.is_symlink() and path.resolve().parent != self._folder.resolve():
                 raise Refused("bad_model", f"{name}: leads out of the folder of models")
-            model = load_model_elsewhere(path, self._state.stopping)
+            model = load_model_elsewhere(path, self._state.stopping, stiffness_factor)
         except (OSError, RuntimeError, ModelFileError) as error:  # RuntimeError: links in a circle
             raise Refused("bad_model", str(error).replace(f"{self._folder}/", "")) from error
         if (names := tuple(tool.name for tool in models.tools_of(model))) != self._state.tools:
@@ -123,6 +125,12 @@ class ModelLoader:
                 f"{name}: its period is {model.period_s} s, the running model's {self._state.model.period_s} s",
             )
         return model
+
+
+def model_files(folder: Path) -> list[str]:
+    """The names that `load` may be asked for: of the files *.npz in a folder, sorted, the first _MOST_FILES."""
+    names = sorted(path.name for path in folder.glob("*.npz") if is_plain_name(path.name))
+    return names[:_MOST_FILES]
 
 
 def accuracy_warnings(model: Model) -> list[str]:

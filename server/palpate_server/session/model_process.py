@@ -1,6 +1,6 @@
 """Reads a model file in a process of its own, so that the running server neither unpacks nor checks one.
 
-    python -m palpate_server.session.model_process FILE DESCRIPTOR
+    python -m palpate_server.session.model_process FILE STIFFNESS_FACTOR DESCRIPTOR
 
 A large or damaged file costs the server's process neither the interpreter's lock nor memory beyond the model. The child puts
 the checked model into an anonymous file (a memfd) that it inherits: a pickle without its arrays, then the arrays. The
@@ -20,7 +20,7 @@ import threading
 import time
 from pathlib import Path
 
-from palpate.model_file import ModelFileError, load_model
+from palpate.model_file import ModelFileError, SurfaceModel, load_model, stiffened
 from palpate_server.coupling.models import Model
 
 _TIMEOUT_S = 60.0
@@ -32,15 +32,17 @@ _ALIGNMENT = 64
 _HEAD = struct.Struct("<QQ")  # bytes of the pickle, number of arrays; then the bytes of each array as <Q
 
 
-def load_model_elsewhere(path: Path, stopping: threading.Event) -> Model:
-    """The model in a file, as `load_model` gives it, its arrays read-only.
+def load_model_elsewhere(path: Path, stopping: threading.Event, stiffness_factor: float = 1.0) -> Model:
+    """The model in a file, as `load_model` gives it, with its moduli times a factor; its arrays are read-only.
 
-    Raises ModelFileError for what is no model, takes too long, or when `stopping` is set meanwhile; OSError.
+    Raises ModelFileError for what is no model, takes too long, has no modulus to change, or when `stopping` is set meanwhile;
+    OSError.
     """
     descriptor = os.memfd_create("palpate-model")
     try:
+        what = (str(path), repr(stiffness_factor), str(descriptor))
         process = subprocess.Popen(
-            [sys.executable, "-m", "palpate_server.session.model_process", str(path), str(descriptor)],
+            [sys.executable, "-m", "palpate_server.session.model_process", *what],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
@@ -92,12 +94,23 @@ def _send(model: Model, descriptor: int) -> None:
             file.write(array)
 
 
+def _with_stiffness(model: Model, factor: float, path: Path) -> Model:
+    """Raises ModelFileError for a patch model and a factor that is not 1."""
+    if factor == 1.0:
+        return model
+    if not isinstance(model, SurfaceModel):
+        raise ModelFileError(
+            f"{path}: a model of patches has no modulus: stiffness_factor is {factor:g}, expected 1"
+        )
+    return stiffened(model, factor)
+
+
 def main() -> int:
-    path, descriptor = Path(sys.argv[1]), int(sys.argv[2])
+    path, factor, descriptor = Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
     os.nice(_NICE)
     resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY_BYTES, _MOST_MEMORY_BYTES))
     try:
-        _send(load_model(path), descriptor)
+        _send(_with_stiffness(load_model(path), factor, path), descriptor)
     except (OSError, RuntimeError, ModelFileError) as error:
         print(error, file=sys.stderr)
         return _EXIT_REFUSED

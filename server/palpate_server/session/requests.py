@@ -80,7 +80,8 @@ class Requests:
             case "reset":
                 return self._reset(client)
             case "load":
-                return self._loader.load(client, fields.required(request, "file"))
+                file, factor = fields.required(request, "file"), fields.stiffness_factor_in(request)
+                return self._loader.load(client, file, factor)
             case "record":
                 return self.recordings.record(client, fields.required(request, "file"))
         raise ValueError(f"{action!r} is none of wire.ACTIONS")

@@ -23,6 +23,7 @@ from palpate_server.realtime import safety, scheduler, shared_memory, threads
 from palpate_server.realtime.safety import Limits
 from palpate_server.recording.black_box import BlackBox
 from palpate_server.session.admission import Admission
+from palpate_server.session.loading import model_files
 from palpate_server.session.publishing import ForcePublisher, StatusPublisher, SurfacePublisher
 from palpate_server.session.queries import Queries
 from palpate_server.session.requests import Requests
@@ -47,6 +48,7 @@ class ServerOptions:
     black_box   the folder for black box files, or None
     surface_hz  surfaces a second, at most MAX_SURFACE_HZ
     cpu         the processor for the threads that run ticks, or None to leave that to the system
+    model_file  name of the model's file in the folder `models`; None if it is not from there
     """
 
     limits: Limits
@@ -56,6 +58,7 @@ class ServerOptions:
     black_box: Path | None = None
     surface_hz: float = DEFAULT_SURFACE_HZ
     cpu: int | None = None
+    model_file: str | None = None
 
 
 class Server:
@@ -68,6 +71,7 @@ class Server:
 
     def __init__(self, model: Model, session: zenoh.Session, keys: Keys, options: ServerOptions) -> None:
         state = SessionState(model, options.limits, keys, 1 / options.surface_hz)
+        state.model_file = options.model_file
         self.state = state
         self._session = session
         self._cpu = options.cpu
@@ -90,7 +94,7 @@ class Server:
         self._queries = Queries(
             keys,
             self._requests,
-            describe=lambda: pack(description(state)),
+            describe=lambda: pack(description(state) | {"model_files": model_files(options.models)}),
             geometry=lambda: _geometry(state.model),
             on_change=self._status.publish,  # so that a status shows every setting
         )

@@ -38,6 +38,7 @@ class SessionState:
     """One model in one session.
 
     model          the one that runs; while another is faded in, still the old one
+    model_file     name of its file in the folder of models; None if it is not from there
     limits         what no client can exceed
     tools          their names, in the model's order
     tool_index     index of each name in `tools`
@@ -56,6 +57,7 @@ class SessionState:
 
     def __init__(self, model: Model, limits: Limits, keys: Keys, surface_period_s: float) -> None:
         self.model = model
+        self.model_file: str | None = None
         self.limits = limits
         self.keys = keys
         self.surface_period_s = surface_period_s

@@ -112,7 +112,7 @@ def _tool_status(state: SessionState, name: str) -> dict[str, Any]:
 
 
 def description(state: SessionState) -> dict[str, Any]:
-    """The answer to `describe`."""
+    """The answer to `describe`, but for `model_files`."""
     summary = state.model.summary()
     summary["accuracy"].pop("hankel_singular_values", None)
     return {
@@ -138,5 +138,6 @@ def description(state: SessionState) -> dict[str, Any]:
         "status_period_s": STATUS_PERIOD_S,
         "surface_period_s": state.surface_period_s,
         "flags": {flag.name: flag.value for flag in Flags},
-        "model": summary,
+        "model": summary | identity(state.model),
+        "model_file": state.model_file,
     }

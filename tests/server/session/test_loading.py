@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.model_file import ModelFileError, ReducedModel, load_model, save_model
+from palpate.model_file import ModelFileError, ReducedModel, SurfaceModel, load_model, save_model
+from palpate_server.recording.snapshot import identity
 from palpate_server.session.loading import accuracy_warnings
 from palpate_server.session.model_process import load_model_elsewhere
 
@@ -28,6 +29,20 @@ def test_a_model_read_elsewhere_is_the_same(model_file: Path) -> None:
         for field in fields(getattr(here, part)):
             expected = getattr(getattr(here, part), field.name)
             np.testing.assert_array_equal(getattr(getattr(elsewhere, part), field.name), expected)
+
+
+def test_a_model_read_elsewhere_is_as_stiff_as_asked_for(
+    make_surface_model: Callable[..., SurfaceModel], model_file: Path, tmp_path: Path
+) -> None:
+    model, path = make_surface_model(), tmp_path / "surface.npz"
+    save_model(model, path)
+    read = load_model_elsewhere(path, threading.Event(), 2.5)
+    assert isinstance(read, SurfaceModel)
+    np.testing.assert_array_equal(read.residual, model.residual / np.float32(2.5))
+    np.testing.assert_array_equal(read.squared_frequencies, model.squared_frequencies * 2.5)
+    assert identity(read) == identity(model) | {"stiffness_factor": 2.5}
+    with pytest.raises(ModelFileError, match=r"stiffness_factor is 2\.5, expected 1"):
+        load_model_elsewhere(model_file, threading.Event(), 2.5)
 
 
 def test_a_damaged_file_is_refused_in_the_words_of_its_reader(model_file: Path) -> None:
