@@ -19,6 +19,7 @@ from typing import Any
 
 import viser
 import zenoh
+from viser._messages import RunJavascriptMessage
 
 from palpate_client import ClientError, Connection, Incompatible, ServerGone
 from palpate_client.arguments import add_connection_options, connection_for
@@ -28,6 +29,15 @@ from palpate_view.session import Session
 DEFAULT_PORT = 8080
 RETRY_S = 1.0
 _TOLD_S = 6.0
+# The page ends a drag when its window loses the focus. A page that is hidden or closed does so, too: at once, where the end of its
+# connection is seen some 0.1 s later, because the browser ends the thread that has it first.
+_LET_GO = """
+if (!window.palpateLetsGo) {
+  window.palpateLetsGo = () => window.dispatchEvent(new Event("blur"));
+  window.addEventListener("pagehide", window.palpateLetsGo);
+  document.addEventListener("visibilitychange", () => { if (document.hidden) window.palpateLetsGo(); });
+}
+"""
 
 
 class Page(viser.ViserServer):
@@ -72,6 +82,8 @@ class View:
             client.add_notification("palpate", text, auto_close_seconds=_TOLD_S)
 
     async def _opened(self, client: viser.ClientHandle) -> None:
+        # viser has no public way to this message of its own.
+        client._websock_connection.queue_message(RunJavascriptMessage(_LET_GO))
         if client.camera.aspect < 1.0:  # on a phone the controls would cover the organ
             client.gui.main_panel.minimize()
         if session := self.session:

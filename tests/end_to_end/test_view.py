@@ -6,7 +6,10 @@ It needs Chromium, such as Debian's packages `chromium` and `fonts-dejavu-core`.
 from __future__ import annotations
 
 import math
+import os
 import shutil
+import signal
+import statistics
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +23,7 @@ from palpate_client.local_server import free_endpoint
 from palpate_client.wire import Flags
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+Image = pytest.importorskip("PIL.Image")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 # A browser that draws in software takes a processor for itself.
 pytestmark = [
@@ -30,7 +34,11 @@ pytestmark = [
 
 PICTURES = Path(__file__).parents[2] / "out" / "screenshots"
 PATIENCE_MS = 180_000
+N_CLOSINGS = 5
 CLOSED_S = 0.1  # from the page's close to no force
+NOTE_CLOSE = """addEventListener("pagehide", () =>
+    localStorage.setItem("closed_ms", performance.timeOrigin + performance.now()))"""
+N_COLORED = 300  # pixels of deformed tissue
 # Pictures are drawn in software; what is around the picture is quicker without the detour over the graphics library.
 SWIFTSHADER = (
     "--no-sandbox",
@@ -59,8 +67,10 @@ def browser() -> Iterator[Any]:
 
 def opened(browser: Any, address: str, **options: Any) -> Any:
     """The page, once it shows the organ."""
-    page = browser.new_page(**(options or {"viewport": {"width": 1040, "height": 600}}))
+    context = browser.new_context(**(options or {"viewport": {"width": 1040, "height": 600}}))
+    page = context.new_page()
     page.set_default_timeout(PATIENCE_MS)
+    page.add_init_script(NOTE_CLOSE)
     page.goto(address)
     page.get_by_text("Drag on the organ").wait_for(state="attached")  # on a phone the controls are closed
     page.evaluate("document.querySelectorAll('[class*=Notification] button').forEach(b => b.click())")
@@ -86,6 +96,25 @@ def drag_until(page: Any, condition: Callable[[], object], what: str) -> None:
         page.mouse.move(x + 25 * math.sin(i / 8), y + 12 * math.sin(i / 5))
 
 
+def close(page: Any) -> int:
+    """Close a page; when it was closed, as the page itself noted it, ns on this machine's monotonic clock."""
+    context, address = page.context, page.url
+    offset_ns = time.time_ns() - time.monotonic_ns()
+    page.close()
+    blank = context.new_page()  # of the same origin, which has the note
+    blank.route("**/note", lambda route: route.fulfill(body="<html></html>", content_type="text/html"))
+    blank.goto(f"{address.rstrip('/')}/note")
+    closed_ms = float(blank.evaluate("localStorage.getItem('closed_ms')"))
+    context.close()
+    return round(closed_ms * 1e6) - offset_ns
+
+
+def colored_pixels(picture: Path) -> int:
+    """How many pixels have the colors of tissue that is displaced by a third of the scale and more."""
+    r, g, b = np.moveaxis(np.asarray(Image.open(picture).convert("RGB"), int), 2, 0)
+    return int(np.count_nonzero((r > 200) & (g > 120) & (g < r) & (b < 0.75 * g)))
+
+
 def newtons(message: dict[str, Any]) -> float:
     return float(np.linalg.norm(message["force_n"][0]))
 
@@ -104,28 +133,78 @@ def test_a_drag_on_the_organ_presses_and_the_closed_page_lets_go(
     served = serve(model=make_surface_model())
     address = view(served.endpoint)
     with connect(served.endpoint) as client:
+        page = opened(browser, address)
+        page.screenshot(path=PICTURES / "surface_at_rest.png")
+        drag_until(page, lambda: newtons(client.forces[-1]) > 0.15, "a force")
+        drag_until(page, lambda: newtons_shown(page) > 0.1, "the force on the page")
+        page.screenshot(path=PICTURES / "surface_pressed.png")
+        assert colored_pixels(PICTURES / "surface_at_rest.png") < N_COLORED
+        assert colored_pixels(PICTURES / "surface_pressed.png") > N_COLORED
+        page.mouse.up()  # the picture may have taken so long that the tool was let go
         took_s = []
-        for _ in range(3):  # a busy machine may close a page late
-            page = opened(browser, address)
-            at_rest = page.screenshot(path=PICTURES / "surface_at_rest.png")
+        for _ in range(N_CLOSINGS):
             drag_until(page, lambda: newtons(client.forces[-1]) > 0.15, "a force")
-            drag_until(page, lambda page=page: newtons_shown(page) > 0.1, "the force on the page")
-            assert page.screenshot(path=PICTURES / "surface_pressed.png") != at_rest
-            page.mouse.up()  # the picture may have taken so long that the tool was let go
-            drag_until(page, lambda: newtons(client.forces[-1]) > 0.15, "a force again")
             pressed = next(m for m in reversed(client.forces) if newtons(m) > 0.15)
             assert pressed["flags"][0] & Flags.IN_CONTACT
             assert pressed["n_contact_points"][0] > 0
-            closed_ns = time.monotonic_ns()
-            page.close()
-            gone = client.force_when(lambda message: newtons(message) == 0, "no force")
-            first = next(m for m in client.forces if m["server_time_ns"] > closed_ns and newtons(m) == 0)
-            assert gone["tick"] >= first["tick"]
-            took_s.append((first["server_time_ns"] - closed_ns) * 1e-9)
+            closed_ns = close(page)
             client.status_when(lambda status: status["tools"]["tip"]["holder"] is None, "a free tool")
-            if took_s[-1] < CLOSED_S:
-                return
-    raise AssertionError(f"the force was gone {took_s} s after the page was closed, expected {CLOSED_S}")
+            client.force_when(lambda message: newtons(message) == 0, "no force")
+            first = next(m for m in client.forces if m["server_time_ns"] > closed_ns and newtons(m) == 0)
+            took_s.append((first["server_time_ns"] - closed_ns) * 1e-9)
+            page = opened(browser, address)
+    print(f"no force {sorted(round(1e3 * t) for t in took_s)} ms after the page was closed")
+    assert statistics.median(took_s) < CLOSED_S, took_s
+
+
+def renderers(of: int) -> list[int]:
+    """The processes of Chromium that run its pages, of those that a process has started."""
+    found, parents = [], {of}
+    for status in sorted(Path("/proc").glob("[0-9]*/status"), key=lambda path: int(path.parts[2])):
+        try:
+            fields = dict(line.split(":\t", 1) for line in status.read_text().splitlines() if ":\t" in line)
+            command = (status.parent / "cmdline").read_bytes()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        if int(fields["PPid"]) in parents:
+            parents.add(int(fields["Pid"]))
+            if b"--type=renderer" in command:
+                found.append(int(fields["Pid"]))
+    return found
+
+
+def test_a_page_that_is_hidden_or_stopped_lets_go(
+    browser: Any,
+    serve: Callable[..., Any],
+    view: Callable[[str], str],
+    connect: Callable[..., Any],
+    make_surface_model: Callable[..., SurfaceModel],
+) -> None:
+    served = serve(model=make_surface_model())
+    address = view(served.endpoint)
+    with connect(served.endpoint) as client:
+
+        def let_go(what: str) -> None:
+            client.status_when(lambda status: status["tools"]["tip"]["holder"] is None, "a free tool")
+            client.force_when(lambda message: newtons(message) == 0, what)
+
+        page = opened(browser, address)
+        drag_until(page, lambda: newtons(client.forces[-1]) > 0.15, "a force")
+        page.context.new_page().bring_to_front()
+        let_go("no force of a page that is hidden")
+        page.context.close()
+        page = opened(browser, address)
+        drag_until(page, lambda: newtons(client.forces[-1]) > 0.15, "a force")
+        stopped = renderers(os.getpid())
+        assert stopped
+        try:
+            for process in stopped:
+                os.kill(process, signal.SIGSTOP)
+            let_go("no force of a page that is stopped")
+        finally:
+            for process in stopped:
+                os.kill(process, signal.SIGCONT)
+        page.context.close()
 
 
 def test_a_patch_is_dragged_and_let_go_with_the_button_and_by_a_page_that_hangs(
@@ -144,6 +223,11 @@ def test_a_patch_is_dragged_and_let_go_with_the_button_and_by_a_page_that_hangs(
         page.context.new_cdp_session(page).send("Page.setWebLifecycleState", {"state": "frozen"})
         client.status_when(lambda status: status["tools"]["tip"]["holder"] is None, "a free tool")
         client.force_when(lambda message: newtons(message) == 0, "no force of a page that hangs")
+
+
+def choose(page: Any, label: str, option: str) -> None:
+    page.get_by_label(label, exact=True).first.click()
+    page.get_by_role("option", name=option).click()
 
 
 def test_buttons_record_and_load_another_model(
@@ -167,7 +251,15 @@ def test_buttons_record_and_load_another_model(
         page.get_by_role("button", name="Stop recording").click()
         client.status_when(lambda status: status["recording"] is None, "the end of the recording")
         assert (recordings / recording["file"]).stat().st_size > 0
-        page.get_by_label("Model file").fill("other.npz")
+        choose(page, "Model", "model1.npz")  # the one that runs
+        factor = page.get_by_label("Stiffness, times the file's")
+        factor.fill("3")
+        factor.press("Enter")
+        page.get_by_role("button", name="Load").click()
+        client.status_when(lambda status: status["model"]["stiffness_factor"] == 3.0, "a stiffer model")
+        page.get_by_text("stiffness factor").first.wait_for()
+        page.screenshot(path=PICTURES / "stiffer.png")
+        choose(page, "Model", "other.npz")
         page.get_by_role("button", name="Load").click()
         client.status_when(lambda status: status["model"]["kind"] == "patch", "the other model")
         page.get_by_text("masses on springs").first.wait_for()

@@ -31,7 +31,7 @@ class FakePage:
 
     def __init__(self, address: str) -> None:
         self.answers = True
-        self.shows_organ = threading.Event()
+        self.can_drag = threading.Event()
         self._socket = sync_client.connect(
             address.replace("http", "ws"), subprotocols=[f"viser-v{viser.__version__}"], max_size=None
         )
@@ -65,8 +65,11 @@ class FakePage:
                 size = int.from_bytes(window[8:16], "little")
                 messages = msgspec.msgpack.decode(decompressor.decompress(window[16 : 16 + size]))["messages"]
                 for message in messages:
-                    if message.get("name") == "/organ":
-                        self.shows_organ.set()
+                    if (message["type"], message.get("name")) == (
+                        "SetSceneNodeDragBindingsMessage",
+                        "/organ",
+                    ):
+                        self.can_drag.set()
                     if message["type"] == "LocalStorageGetItemRequestMessage" and self.answers:
                         uuid = message["request_uuid"]
                         self.send(
@@ -97,7 +100,7 @@ def press(page: FakePage, client: Any, wait_for: Callable[..., Any]) -> None:
         newest = client.forces[-1]
         return newtons(newest) > 0.1 and newest["force_scale"] == [1.0]
 
-    wait_for(page.shows_organ.is_set, "the organ")
+    wait_for(page.can_drag.is_set, "an organ that can be dragged")
     page.drag("start")
     wait_for(pressed, "a force")
 
