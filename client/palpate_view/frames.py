@@ -61,5 +61,5 @@ def tool_state(force: Force, tool: Mapping[str, Any]) -> ToolState:
     if stiffness is None or newtons == 0:
         return ToolState(device, device, force_n)
     length_m = math.sqrt(2 * max(force.touch.stored_j, 0.0) / stiffness)  # at the client
-    spring = np.asarray(force.force_n, float) * (length_m / newtons)
+    spring = [length_m / newtons * c for c in force.force_n]
     return ToolState(device, device + float(frame["scale"]) * direction_in_model(frame, spring), force_n)
