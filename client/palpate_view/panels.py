@@ -111,7 +111,7 @@ class Panels:
         with gui.add_folder("Session"):
             self.model = gui.add_dropdown("Model", ("-",), hint="Of the server's folder of models")
             self.stiffness = gui.add_slider(
-                "Stiffness, times the file's", 0.1, 10.0, 0.1, 1.0, visible=False, hint="Of all moduli"
+                "Stiffness", 0.1, 10.0, 0.1, 1.0, visible=False, hint="All moduli, times the file's"
             )
             self.load = gui.add_button("Load")
             self.record = gui.add_button(RECORD, icon=viser.Icon.PLAYER_RECORD)

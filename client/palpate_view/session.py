@@ -25,6 +25,7 @@ from palpate_view.surface import Hit, Triangles, ray_hit, touched_points
 from palpate_view.watch import Watch
 
 FRAME_PERIOD_S = 1 / 30
+SLOWEST_FRAME_S = 0.5
 CHART_PERIOD_S = 0.2
 PULSE_S = 0.1  # pause between two questions to the page that drags
 _PULSE_TIMEOUT_S = LONGEST_SILENCE_S
@@ -57,6 +58,8 @@ class Session:
         self._watch = Watch(connection, description.tools[0].name)
         self._axis = np.asarray(description.tools[0].normal, float)  # of the tool's shaft
         self._largest_m = _SMALLEST_SCALE_M
+        # How long the page that drags takes to answer. It gets no more frames than it draws, else it would answer later and later.
+        self._answer_s = 0.0
         page.scene.reset()
         light(page.scene, self._normal())
         page.scene.set_background_image(background(), "png")
@@ -84,7 +87,7 @@ class Session:
         """Draw until another model runs or `stop` is set. Raises ServerGone."""
         charts_s = 0.0
         try:
-            while not stop.wait(FRAME_PERIOD_S):
+            while not stop.wait(max(FRAME_PERIOD_S, min(self._answer_s, SLOWEST_FRAME_S))):
                 self._connection.check()
                 status = self._connection.status
                 if status and any(status["model"][key] != self._model[key] for key in _IDENTITY):
@@ -295,16 +298,20 @@ class Session:
     def _feel_pulse(self, client: viser.ClientHandle, grip: Grip) -> None:
         """Ask the page that drags for a sign of life, again and again: a page that hangs or sleeps does not answer."""
         while self._hand.grip is grip:
+            asked_s = time.monotonic()
             try:
                 client.local_storage.get_item("palpate", timeout=_PULSE_TIMEOUT_S)
             except TimeoutError:
+                self._answer_s = _PULSE_TIMEOUT_S
                 continue
             except (
                 RuntimeError
             ):  # the page is gone, which viser tells apart; or it may not store, and has answered
                 pass
+            self._answer_s = time.monotonic() - asked_s
             self._hand.sign(grip.page)
             time.sleep(PULSE_S)
+        self._answer_s = 0.0
 
     def _hit(self, event: Any) -> Hit | None:
         """Where the pointer is on the undeformed surface."""

@@ -352,8 +352,9 @@ def test_a_model_is_loaded_anew_three_times_as_stiff_and_all_is_repeated(
     model = make_surface_model()
     served = serve("--recordings", str(tmp_path), model=model)
 
-    def settled_n(client: Any) -> float:
-        """The force when the tissue has relaxed."""
+    def settled_n(client: Any, tip_n_per_m: float) -> float:
+        """The force 3 mm deep, by a spring of this stiffness, when the tissue has relaxed."""
+        x, y, z = client.acquire("tip", stiffness_n_per_m=tip_n_per_m)[1]["tools"]["tip"]["home_m"]
 
         def is_still(force: dict[str, Any]) -> bool:
             before = client.forces[max(0, len(client.forces) - 300)]
@@ -362,23 +363,22 @@ def test_a_model_is_loaded_anew_three_times_as_stiff_and_all_is_repeated(
                 abs(newtons - newtons_before) < 2e-3 * newtons
             )
 
-        return float(client.force_when(is_still, "relaxed tissue")["force_n"][0][2])
+        with client.pressing({"tip": [x, y, z + 1e-3]}):
+            client.force_when(lambda force: force["force_scale"] == [1.0], "the end of the soft start")
+        with client.pressing({"tip": [x, y, z - 3e-3]}):
+            client.force_when(lambda force: force["force_n"][0][2] > 0.05, "a force")
+            return float(client.force_when(is_still, "relaxed tissue")["force_n"][0][2])
 
     with connect(served.endpoint) as client:
         described = client.query("describe")[1]
         assert described["model_file"] in described["model_files"]
-        x, y, z = client.acquire("tip", stiffness_n_per_m=200.0)[1]["tools"]["tip"]["home_m"]
-        with client.pressing({"tip": [x, y, z - 3e-3]}):
-            soft_n = settled_n(client)
-        client.acquire("tip", stiffness_n_per_m=600.0)
+        soft_n = settled_n(client, 200.0)
         client.record("a.mcap")
-        with client.pressing({"tip": [x, y, z - 3e-3]}):
-            client.force_when(lambda force: force["force_n"][0][2] > soft_n, "a force")
-            granted, answer = client.control("load", file=described["model_file"], stiffness_factor=3)
-            assert granted and answer["model"]["stiffness_factor"] == 3.0, answer
-            client.status_when(lambda status: status["model"]["stiffness_factor"] == 3.0, "the factor")
-            stiff_n = settled_n(client)
-            assert client.control("record", file=None)[0]
+        granted, answer = client.control("load", file=described["model_file"], stiffness_factor=3)
+        assert granted and answer["model"]["stiffness_factor"] == 3.0, answer
+        client.status_when(lambda status: status["model"]["stiffness_factor"] == 3.0, "the factor")
+        stiff_n = settled_n(client, 600.0)
+        assert client.control("record", file=None)[0]
         assert client.query("describe")[1]["model"]["band_hz"][1] == pytest.approx(model.band_hz[1] * 3**0.5)
         for wrong in ("3", 0.01, -1, float("nan")):
             assert not client.control("load", file=described["model_file"], stiffness_factor=wrong)[0]

@@ -252,7 +252,7 @@ def test_buttons_record_and_load_another_model(
         client.status_when(lambda status: status["recording"] is None, "the end of the recording")
         assert (recordings / recording["file"]).stat().st_size > 0
         choose(page, "Model", "model1.npz")  # the one that runs
-        factor = page.get_by_label("Stiffness, times the file's")
+        factor = page.get_by_label("Stiffness", exact=True).first
         factor.fill("3")
         factor.press("Enter")
         page.get_by_role("button", name="Load").click()
