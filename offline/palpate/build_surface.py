@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from palpate.discretization import conservative
-from palpate.factorization import solver_name
-from palpate.factorization.dense import dense_memory
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.measures import enclosed_volume
 from palpate.geometry.node_surface import node_surface
@@ -115,9 +113,8 @@ def surface_body(
     body = unit.scaled(material.youngs_modulus_pa, material.density_kg_per_m3)
     progress.note(f"memory needed about {needed / 2**30:.1f} GiB")
     touched = _touched(config, cloud, fixed, body.basis.value)
-    n_solves = int(_SURFACE_SOLVES * guess) + 3 * len(touched.nodes)
     key = key_of(keys.surface, fingerprint(config, folder))
-    return SurfaceBody(cloud, touched, functools.cache(lambda: hold(body, fixed, n_solves=n_solves)), key)
+    return SurfaceBody(cloud, touched, functools.cache(lambda: hold(body, fixed)), key)
 
 
 def surface_modes(
@@ -185,8 +182,7 @@ def _require_memory(cloud: NodeCloud, n_modes: int, support_radius_factor: float
     """Bytes that the build needs at its peak. Raises MemoryError where the machine has less."""
     n, n_points = 3 * cloud.n_nodes, int(cloud.boundary.sum())
     stiffness = stiffness_memory(cloud.n_nodes, support_radius_factor)
-    dense = solver_name(n, int(_SURFACE_SOLVES * n_modes) + 3 * n_points) == "LAPACK"
-    factor = dense_memory(n) if dense else factor_memory(cloud.n_nodes, support_radius_factor)
+    factor = factor_memory(cloud.n_nodes, support_radius_factor)
     space = 2 * 8 * n * _SURFACE_SOLVES * n_modes
     needed = (
         0.5 * 2**30

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from palpate.factorization import pardiso
-from palpate.factorization.dense import DenseCholesky
 from palpate.factorization.multifrontal import MultifrontalCholesky
 from palpate.factorization.superlu import SuperLU
 
@@ -17,12 +16,6 @@ Array = NDArray[np.float64]
 
 ACCEPTED_ERROR = 1e-10
 """Largest backward error |b - A x| / (|A| |x| + |b|) of a solution, in 1-norms: above it the solver has failed."""
-
-DENSE_UP_TO = 15_000
-"""Rows of a matrix, 1.8 GB when dense, up to which LAPACK replaces SuperLU for many right-hand sides."""
-
-MANY = 1000
-"""Right-hand sides from which it does: one costs SuperLU 0.05 s at 11,600 rows, LAPACK 0.01 s and the factor 15 s more."""
 
 _REFINED_ABOVE = 1e-14
 _MOST_REFINEMENTS = 3
@@ -91,38 +84,30 @@ class SymmetricFactor:
         return sum((term @ x for term in self._terms[1:]), start=self._terms[0] @ x)
 
 
-def solver_name(n_rows: int = 0, n_solves: int = 0) -> str:
+def solver_name() -> str:
     """The direct solver that `factorize` uses on this machine for a definite matrix of nodes with places."""
-    if pardiso.library() is not None:
-        return "MKL PARDISO"
-    return "LAPACK" if n_solves >= MANY and n_rows <= DENSE_UP_TO else "multifrontal Cholesky"
+    return "multifrontal Cholesky" if pardiso.library() is None else "MKL PARDISO"
 
 
-def factorize(
-    *terms: csr_array, definite: bool = True, points: Array | None = None, n_solves: int = 0
-) -> SymmetricFactor:
+def factorize(*terms: csr_array, definite: bool = True, points: Array | None = None) -> SymmetricFactor:
     """The factor of a symmetric matrix (n, n), the sum of `terms`: by MKL PARDISO where the package `mkl` is installed. Else a
-    definite one of nodes with places by `MultifrontalCholesky`, or by LAPACK as a dense one where it is not large, and many
-    solutions follow; any other by SuperLU.
+    definite one of nodes with places by `MultifrontalCholesky`, any other by SuperLU.
 
     terms     symmetric, with both triangles. Their sum does not outlive the factorization: a large matrix and a small change
               of it take the memory of one
     definite  whether all eigenvalues are expected to be positive
     points    (n_nodes, dim), m: places of the nodes, near ones of which are coupled, where the matrix consists of dense
               blocks for n / n_nodes unknowns of each node in sequence
-    n_solves  about how many right-hand sides will come
 
     Raises LinAlgError where a matrix that is said to be definite is not (SuperLU factorizes it, and n_negative tells), or
     where one is singular; MemoryError where the factor does not fit.
     """
-    name = solver_name(terms[0].shape[0], n_solves)
+    name = solver_name()
     norm = sum(_norm(term) for term in terms)
     backend: _Backend
     if name == "MKL PARDISO":
         block = terms[0].shape[0] // len(points) if definite and points is not None else 1
         backend = pardiso.Pardiso(pardiso.upper_triangle(_sum(terms), block), definite)
-    elif name == "LAPACK" and definite:
-        backend = DenseCholesky(_sum(terms))
     elif definite and points is not None:
         backend = MultifrontalCholesky(terms, points)
     else:

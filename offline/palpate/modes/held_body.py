@@ -107,15 +107,15 @@ class HeldBody:
         return solution
 
 
-def hold(body: AssembledBody, nodes: Indices, n_solves: int = 0) -> HeldBody:
-    """Factorize K with the nodes held. About n_solves loads will come.
+def hold(body: AssembledBody, nodes: Indices) -> HeldBody:
+    """Factorize K with the nodes held.
 
     Raises ValueError for a body that is not symmetric; LinAlgError where the nodes do not hold the body or the shape
     functions of two held nodes are the same; MemoryError where the factor does not fit.
     """
     if not body.symmetric:
         raise ValueError("the body is not symmetric: expected one of the conservative discretization")
-    factor = factorize(body.stiffness, penalty(body, nodes), points=body.basis.points, n_solves=n_solves)
+    factor = factorize(body.stiffness, penalty(body, nodes), points=body.basis.points)
     return HeldBody(body, Constraints.of(body, nodes), factor)
 
 

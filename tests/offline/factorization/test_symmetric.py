@@ -120,19 +120,3 @@ def test_an_inexact_factor_is_refined(monkeypatch):
     factor = _solutions_times(1 + 1e-6, factorize(matrix), monkeypatch)
     right = np.random.default_rng(4).standard_normal((125, 3))
     np.testing.assert_allclose(factor.solve(right), np.linalg.solve(matrix.toarray(), right), atol=1e-13)
-
-
-def test_many_right_hand_sides_are_solved_for_by_a_dense_factor_where_mkl_is_missing(monkeypatch):
-    monkeypatch.setattr(pardiso, "library", lambda: None)
-    matrix = _laplacian(6)
-    factor = factorize(matrix, n_solves=5000)
-    assert factor.solver == solver_name(216, 5000) == "LAPACK"
-    assert factor.n_negative == 0
-    expected = np.random.default_rng(4).standard_normal((216, 7))
-    condition = _eigenvalues(6).max() / _eigenvalues(6).min()
-    np.testing.assert_allclose(factor.solve(matrix @ expected), expected, atol=100 * EPS * condition)
-    assert factorize(matrix, n_solves=10).solver == "SuperLU"
-    assert solver_name(100_000, 10**6) == "multifrontal Cholesky"
-    assert factorize(_laplacian(6, 3.3), definite=False, n_solves=5000).solver == "SuperLU"
-    with pytest.raises(np.linalg.LinAlgError):
-        factorize(_laplacian(6, 3.3), n_solves=5000)
