@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.demo.surface import Slide, _felt, _Sent
+from palpate.demo.surface import Slide, _felt, _Sent, row_of
 from palpate.model_file import SurfaceModel
 from palpate_client import Surface
 from palpate_client.wire import FORCE_FIELDS, PER_TICK
@@ -39,7 +39,8 @@ def sent() -> _Sent:
         message(103, force_n=[0.0, 0.1, 1.5], work_j=work, **up, **energies),
         message(104, work_j=work, **energies),
     ]
-    return _Sent(forces, [Surface(101, 0, [0.0]), Surface(102, 0, [1.0, 2.0, 3.0])], 1, 700.0, {})
+    surfaces = [Surface(101, 0, [0.0]), Surface(102, 0, [1.0, 2.0, 3.0])]
+    return _Sent([row_of(message, 1) for message in forces], surfaces, 700.0, {})
 
 
 @pytest.fixture

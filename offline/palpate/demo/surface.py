@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,16 +32,9 @@ _NEAR = 2.4
 """Radii from the tool's center within which points may be touched."""
 
 _STATUS_WAIT_S = 1.0
-_PER_TOOL = (
-    "position_m",
-    "force_n",
-    "force_scale",
-    "normal",
-    "n_contact_points",
-    "work_j",
-    "stored_j",
-    "dissipated_j",
-)
+_NUMBERS = ("force_scale", "n_contact_points", "work_j", "stored_j", "dissipated_j")
+_VECTORS = ("position_m", "force_n", "normal")
+_OF_TISSUE = ("tissue_stored_j", "tissue_dissipated_j")
 _BALANCED_J = 1e-9
 
 
@@ -143,21 +136,20 @@ def slide(
 class _Sent:
     """What the server sent during a motion.
 
-    forces, surfaces   messages, in the order of their ticks
-    index              of the tool in the lists of a force message
+    forces             `row_of` each tick that came, in their order
+    surfaces           about thirty a second
     stiffness_n_per_m  of the tool's spring
     client             summary of the contract
     """
 
-    forces: list[dict[str, Any]]
+    forces: list[tuple[float, ...]]
     surfaces: list[Surface]
-    index: int
     stiffness_n_per_m: float
     client: dict[str, Any]
 
     def displacement_m(self) -> Array:
         """(n_points, 3), of the surface nearest to halfway."""
-        halfway = (self.forces[0]["tick"] + self.forces[-1]["tick"]) / 2
+        halfway = (self.forces[0][0] + self.forces[-1][0]) / 2
         nearest = min(self.surfaces, key=lambda surface: abs(surface.tick - halfway))
         return np.array(nearest.displacement_m, np.float64).reshape(-1, 3)
 
@@ -165,7 +157,7 @@ class _Sent:
 def _moved(model: SurfaceModel, endpoint: str, path: Array, progress: Progress) -> _Sent:
     """Have the server move the first tool along a path (n_ticks, 3), m. Errors as `slide`."""
     name, velocity = model.tools[0].name, np.asarray(np.gradient(path, model.period_s, axis=0))
-    forces: list[dict[str, Any]] = []
+    forces: list[tuple[float, ...]] = []
     surfaces: list[Surface] = []
     # A full collection looks at all objects of the build, for tenths of a second, in which no command is sent.
     gc.collect()
@@ -173,7 +165,7 @@ def _moved(model: SurfaceModel, endpoint: str, path: Array, progress: Progress) 
     try:
         with Connection(endpoint, name="demo") as connection, Tool(connection, name) as moved:
             index = connection.description.index(name)
-            connection.on_force(lambda message, arrival_ns: forces.append(message))
+            connection.on_force(lambda message, arrival_ns: forces.append(row_of(message, index)))
             connection.on_surface(surfaces.append)
             for i in steps(len(path) * model.period_s, model.period_s):
                 moved.move(path[i].tolist(), velocity[i].tolist())
@@ -186,33 +178,42 @@ def _moved(model: SurfaceModel, endpoint: str, path: Array, progress: Progress) 
         raise ValueError(
             f"{len(forces)} ticks and {len(surfaces)} surfaces received, expected at least 2, 1 and a status"
         )
-    return _Sent(forces, surfaces, index, status["tools"][name]["stiffness_n_per_m"], client)
+    return _Sent(forces, surfaces, status["tools"][name]["stiffness_n_per_m"], client)
+
+
+def row_of(message: dict[str, Any], tool: int) -> tuple[float, ...]:
+    """What is drawn of a force message, of a tool by its index: the tick, _NUMBERS, _VECTORS and _OF_TISSUE.
+
+    Numbers alone: Python's garbage collector looks at every list of a message that is kept, and no command is sent meanwhile.
+    """
+    vectors = (value for name in _VECTORS for value in message[name][tool])
+    return (
+        message["tick"],
+        *(message[name][tool] for name in _NUMBERS),
+        *vectors,
+        *(message[name] for name in _OF_TISSUE),
+    )
 
 
 def _felt(sent: _Sent, period_s: float) -> tuple[Felt, Array]:
     """What came over the wire, at every tick, and the scale of the force (n_ticks,). Lost ticks are interpolated."""
-    received = np.array([message["tick"] for message in sent.forces])
+    received, *columns = np.array(sent.forces, np.float64).T
     ticks = np.arange(received[0], received[-1] + 1)
-
-    def at_every_tick(values: Iterable[Any]) -> Array:
-        columns = np.array(list(values), np.float64).reshape(len(received), -1).T
-        return np.stack([np.interp(ticks, received, column) for column in columns], axis=1)
-
-    of_tool = {
-        name: at_every_tick(message[name][sent.index] for message in sent.forces) for name in _PER_TOOL
-    }
-    tissue = at_every_tick((m["tissue_stored_j"], m["tissue_dissipated_j"]) for m in sent.forces)
+    at_every_tick = np.stack([np.interp(ticks, received, column) for column in columns], axis=1)
+    scale, n_points, work, spring, lost = at_every_tick[:, :5].T
+    position, force, normal = at_every_tick[:, 5:14].reshape(-1, 3, 3).transpose(1, 0, 2)
+    stored, dissipated = at_every_tick[:, 14:].T
     felt = Felt(
         time_s=(ticks - ticks[0]) * period_s,
-        position_m=of_tool["position_m"],
-        force_n=of_tool["force_n"],
-        normal=of_tool["normal"],
-        n_points=of_tool["n_contact_points"][:, 0].astype(int),
-        work_j=of_tool["work_j"][:, 0],
-        stored_j=tissue[:, 0] + of_tool["stored_j"][:, 0],
-        dissipated_j=tissue[:, 1] + of_tool["dissipated_j"][:, 0],
+        position_m=position,
+        force_n=force,
+        normal=normal,
+        n_points=n_points.astype(int),
+        work_j=work,
+        stored_j=stored + spring,
+        dissipated_j=dissipated + lost,
     )
-    return felt, of_tool["force_scale"][:, 0]
+    return felt, scale
 
 
 def surface_path(model: SurfaceModel, seconds: float) -> Array:
