@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.model_file import ReducedModel, SurfaceModel, save_model
+from palpate.model_file import ReducedModel, SurfaceModel, load_model, save_model
 from palpate_server.coupling import models
 from palpate_server.errors import Refused
 from palpate_server.realtime import scheduler
-from palpate_server.session import status
+from palpate_server.session import loading, status
 from palpate_server.session.requests import Requests
 from palpate_server.session.tips import tip_warnings
 
@@ -74,7 +74,9 @@ def test_a_model_that_is_loaded_brings_its_own_tips_except_for_what_was_asked_fo
     make_surface_model: Callable[..., SurfaceModel],
     make_spring_mass_model: Callable[..., ReducedModel],
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(loading, "load_model_elsewhere", lambda path, _: load_model(path))  # quicker here
     other = make_surface_model(2)
     other = replace(other, tools=tuple(replace(tool, radius_m=0.0048, friction=0.2) for tool in other.tools))
     save_model(other, tmp_path / "other.npz")
