@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from palpate.geometry.cloud import NodeCloud, TriangleSurface
 from palpate.geometry.fill import fill_surface
+from palpate.geometry.places_apart import places_apart
 from palpate.geometry.refinement import refine_surface
 from palpate.geometry.region_edge import Distance
 from palpate.geometry.regions import ContactPatch, contact_patch, distance_outside, nodes_in
@@ -132,18 +133,16 @@ def tool_shapes(config: Config, cloud: NodeCloud) -> tuple[ToolShape, ...]:
 
     Raises ValueError naming a tool whose home is not clear of the body.
     """
-    on_surface = np.flatnonzero(cloud.boundary & in_working_area(config, cloud.points))
-    points, normals = cloud.points[on_surface], cloud.normals[on_surface]
-    away = np.linalg.norm(points - np.average(points, axis=0, weights=cloud.areas[on_surface]), axis=1)
+    nodes = np.flatnonzero(cloud.boundary)
+    working = in_working_area(config, cloud.points[nodes]) & ~np.isin(nodes, fixed_nodes(config, cloud))
+    inside, beyond = nodes[working], nodes[~working]
+    starts = inside[places_apart(cloud.points[inside], cloud.points[beyond], len(config.tool))]
     shapes: list[ToolShape] = []
-    for tool in config.tool:
+    for tool, start in zip(config.tool, starts, strict=True):
         home = tool.home_m
         if home is None:
-            start = np.argmin(away) if not shapes else np.argmax(away)
-            x, y, z = (points[start] + 3 * tool.radius_m * normals[start]).tolist()
+            x, y, z = (cloud.points[start] + 3 * tool.radius_m * cloud.normals[start]).tolist()
             home = (x, y, z)
-            from_start = np.linalg.norm(points - points[start], axis=1)
-            away = from_start if not shapes else np.minimum(away, from_start)
         clear = -float(depth_inside(np.array([home]), cloud.surface)[0])
         if clear <= tool.radius_m:
             raise ValueError(

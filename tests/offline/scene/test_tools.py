@@ -110,6 +110,14 @@ def test_tools_without_a_home_start_clear_of_the_body_and_apart() -> None:
     assert np.linalg.norm(homes[0] - homes[1]) > 0.03
 
 
+def test_tools_without_a_home_start_where_the_body_can_move() -> None:
+    cloud = box_lattice((0, 0, 0), (0.1, 0.1, 0.05), (9, 9, 5))
+    tools = [SCENE["tool"][0] | {"name": f"tip{i}"} for i in range(6)]
+    held = SCENE["fixed"][0]
+    assert held["normal"] == [0.0, 0.0, -1.0]
+    assert min(tool.home_m[2] for tool in tool_shapes(_block(tools), cloud)) > 0.05 / 3
+
+
 def test_a_home_inside_the_body_is_refused() -> None:
     cloud = box_lattice((0, 0, 0), (0.1, 0.1, 0.05), (5, 5, 3))
     near = SCENE["tool"][0] | {"home_m": [0.05, 0.05, 0.053]}
