@@ -58,6 +58,27 @@ def test_a_sphere_is_one_until_it_is_pressed_in_by_its_radius() -> None:
     np.testing.assert_allclose(found, [sneddon(4e-3)[0], sneddon(5e-3)[0]], rtol=0.03)
 
 
+def test_a_body_that_gives_way_as_a_whole_is_felt_as_a_spring_in_series() -> None:
+    """A dome that is pressed away under the tip: contact is between the tip and the dome where it has come to."""
+    radius, dome, spring, depth = 8e-3, 25e-3, 60.0, 4e-3
+    flat = half_space_model(one_tool(radius), 17, 1.5e-3, YOUNG_PA)
+    x, y, _ = flat.points.T
+    points = np.stack([x, y, np.sqrt(dome**2 - x**2 - y**2) - dome], axis=1)
+    held = replace(flat, points=points, normals=(points + np.array([0.0, 0.0, dome])) / dome)
+    moves = np.tile(np.eye(3), (flat.n_points, 1))
+    loose = replace(held, residual=(held.residual + moves @ moves.T / spring).astype(np.float32))
+
+    def felt(model: SurfaceModel, depth: float) -> float:
+        way = straight((0.0, 0.0, radius), (0.0, 0.0, radius - depth), 100)
+        simulation = Simulation(model, 1e6)
+        path(simulation, way)
+        return float(path(simulation, np.repeat(way[-1:], 200, axis=0))[-1].force_n[2])
+
+    force = felt(loose, depth)
+    assert 1e-3 < force / spring < 0.8 * depth
+    assert force == pytest.approx(felt(held, depth - force / spring), rel=0.005)
+
+
 def check_ripple(way_m: float) -> None:
     """The contact is 1.7 spacings in radius."""
     spacing, depth = 2e-3, 3e-3
