@@ -17,7 +17,7 @@ from palpate.geometry.node_surface import node_surface
 from palpate.inclusions import with_inclusions
 from palpate.memory import machine_memory
 from palpate.model_file import SurfaceModel
-from palpate.model_file.contact_size import small_tool_advice
+from palpate.model_file.contact_size import ripple_note, small_tool_advice
 from palpate.modes.body_modes import factor_memory, stiffness_memory
 from palpate.modes.held_body import hold
 from palpate.modes.lanczos import LowestModes, lowest_modes
@@ -157,6 +157,8 @@ def _warn_of_small_tools(config: Config, cloud: NodeCloud, progress: Progress) -
     for tool in config.tool:
         if text := small_tool_advice(tool.name, tool.radius_m, spacing):
             progress.warn(text)
+    if text := ripple_note(min(tool.radius_m for tool in config.tool), spacing):
+        progress.note(text)
 
 
 def _touched(config: Config, cloud: NodeCloud, fixed: NDArray[np.int64], value: csr_array) -> Touched:

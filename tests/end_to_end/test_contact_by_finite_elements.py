@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -69,11 +70,13 @@ def outward(points: Floats) -> Floats:
     return gradient / np.linalg.norm(gradient, axis=0)
 
 
-def built(folder: Path, places: list[Floats], radius: float, fine: float, spacing: float) -> SurfaceModel:
+def built(
+    folder: Path, place: Floats, radius: float, area_radius: float, fine: float, spacing: float
+) -> SurfaceModel:
     sphere = trimesh.creation.icosphere(subdivisions=4)
     (folder / "ellipsoid.ply").write_bytes(ply_bytes(sphere.vertices * AXES_M, sphere.faces))
-    areas = "".join(AREA.format(center=place.tolist(), radius=radius) for place in places)
-    text = SCENE.format(spacing=spacing, held=HELD_BELOW_M, fine=fine, areas=areas, radius=radius)
+    area = AREA.format(center=place.tolist(), radius=area_radius)
+    text = SCENE.format(spacing=spacing, held=HELD_BELOW_M, fine=fine, areas=area, radius=radius)
     return build_surface_model(check_config(tomllib.loads(text), "ellipsoid"), folder)
 
 
@@ -103,7 +106,10 @@ def mesh_around(place: Floats, size_m: float) -> skfem.MeshTet:
 
 
 def by_finite_elements(place: Floats, radius_m: float, size_m: float) -> float:
-    """N, along the normal. Quadratic displacement; pressure linear on the faces, not negative, complementary to the mean gap."""
+    """N, along the normal. Quadratic displacement; pressure linear on the faces, not negative, complementary to the mean gap.
+
+    Beside the normals the sphere stands over the body at rest, moved by the mean displacement of what is pressed.
+    """
     mesh, material = mesh_around(place, size_m), PRESETS["liver"]
     basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementTetP2()), intorder=3)
     lame, mu = material.lame_lambda_pa, material.shear_modulus_pa
@@ -133,37 +139,65 @@ def by_finite_elements(place: Floats, radius_m: float, size_m: float) -> float:
     pressed = skfem.FacetBasis(mesh, skfem.ElementTetP1(), facets=faces, intorder=4)
     vertices = np.unique(mesh.facets[:, faces])
     x = np.asarray(moved.global_coordinates())
+    loads = inward.assemble(pressed, moved, normal=outward(x))[:, vertices].toarray()
+    responses = np.zeros(loads.shape)
+    responses[free] = factor.solve(loads[free])
+
+    def integral(field: Floats) -> Floats:
+        return np.asarray(weighted.assemble(pressed, field=field))[vertices]
+
+    return equilibrium(
+        x,
+        place,
+        radius_m,
+        integral,
+        loads.T @ responses,
+        lambda pressure: np.asarray(moved.interpolate(responses @ pressure)),
+    )
+
+
+def equilibrium(
+    x: Floats,
+    place: Floats,
+    radius_m: float,
+    integral: Callable[[Floats], Floats],
+    compliance: Floats,
+    displacement: Callable[[Floats], Floats],
+) -> float:
+    """The force, N, of a sphere on quadrature points x (3, n_faces, n_points), m.
+
+    integral      of a field (n_faces, n_points) times each of the functions of the pressure
+    displacement  (3, n_faces, n_points), m, from the pressure
+    """
     normal, center = outward(x), place + (1 - DEPTH_OVER_RADIUS) * radius_m * outward(place)
-    away = x - center[:, None, None]
-    along = np.einsum("ifq,ifq->fq", away, normal)
-    beside = away - along * normal
-    reach = np.sqrt(radius_m**2 - np.einsum("ifq,ifq->fq", beside, beside))
-    gap = weighted.assemble(pressed, field=-along - reach)[vertices]
-    loads = inward.assemble(pressed, moved, normal=normal)[free][:, vertices].toarray()
-    pressure = complementary(loads.T @ factor.solve(loads), gap)
-    # The tip feels the gradient of the gap.
-    gradient = np.einsum("i,ifq->fq", outward(place), normal - beside / reach)
-    return float(weighted.assemble(pressed, field=gradient)[vertices] @ pressure)
+    height = -np.einsum("ifq,ifq->fq", x - center[:, None, None], normal)
+    mean, force, before = np.zeros(3), 0.0, np.inf
+    while abs(force - before) > 1e-5 * force:
+        before = force
+        away = x + mean[:, None, None] - center[:, None, None]
+        beside = away - np.einsum("ifq,ifq->fq", away, normal) * normal
+        squared = np.einsum("ifq,ifq->fq", beside, beside)
+        reach = np.sqrt(np.maximum(radius_m**2 - squared, (0.1 * radius_m) ** 2))  # far from what is pressed
+        pressure = complementary(compliance, integral(height - reach))
+        shares = np.array([integral(u) @ pressure for u in displacement(pressure)])
+        mean = shares / (integral(np.ones_like(height)) @ pressure)
+        # The tip feels the gradient of the gap.
+        gradient = np.einsum("i,ifq->fq", outward(place), normal - beside / reach)
+        force = float(integral(gradient) @ pressure)
+    return force
 
 
 def test_a_tip_on_an_ellipsoid_feels_what_finite_elements_say(tmp_path: Path) -> None:
     radius = 0.012
-    model = built(tmp_path, [TOP], radius, fine=0.003, spacing=0.006)
+    model = built(tmp_path, TOP, radius, 0.010, fine=0.002, spacing=0.006)
     assert felt(model, TOP) == pytest.approx(by_finite_elements(TOP, radius, 0.004), rel=0.08)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize(
-    "place",
-    [
-        pytest.param(TOP, id="top"),
-        pytest.param(
-            SIDE, id="side", marks=pytest.mark.xfail(reason="was 7 % softer; the cause is not known")
-        ),
-    ],
-)
+@pytest.mark.parametrize("place", [pytest.param(TOP, id="top"), pytest.param(SIDE, id="side")])
 def test_a_smaller_tip_on_finer_points_is_closer_to_finite_elements(tmp_path: Path, place: Floats) -> None:
+    """The body gives way by 1.9 of the 2.4 mm, so the contact's radius is 1.8 mm: points are 1.5 mm apart."""
     radius = 0.008
-    model = built(tmp_path, [place], radius, fine=0.002, spacing=0.004)
+    model = built(tmp_path, place, radius, 0.007, fine=0.0015, spacing=0.004)
     assert felt(model, place) == pytest.approx(by_finite_elements(place, radius, 0.0025), rel=0.05)

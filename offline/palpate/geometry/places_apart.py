@@ -20,7 +20,7 @@ def places_apart(points: Array, beyond: Array, count: int) -> NDArray[np.intp]:
     """
     inner = np.arange(len(points))
     if len(beyond):
-        from_edge, _ = cKDTree(beyond).query(points)
+        from_edge = np.asarray(cKDTree(beyond).query(points)[0])
         inner = np.flatnonzero(from_edge >= _INSIDE * from_edge.max())
     candidates = points[inner]
     chosen = [int(np.argmin(np.linalg.norm(candidates - points.mean(axis=0), axis=1)))]

@@ -1,4 +1,4 @@
-"""How many points of a surface a small sphere touches: too few, and its force depends on where between them it presses."""
+"""How many points of a surface a small sphere touches: with too few its force is wrong, with few it ripples while the sphere slides."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ FEWEST_POINTS = 3.0
 
 _BLUNT = 0.02
 """A sphere that is blunter by this meets 1 % more force: no more than an error of the model."""
+
+SMOOTH_FROM = 1.7
+"""Contact's radius over the spacing from which the force of a sliding tool ripples by less than 2 % r.m.s. (docs/contact.md)."""
 
 
 def contact_radius_m(tool_radius_m: float) -> float:
@@ -83,6 +86,17 @@ def small_tool_advice(name: str, radius_m: float, spacing_m: float) -> str | Non
     fit = radius_m * math.sqrt(points_in_contact(1.0, 1.0) / FEWEST_POINTS)
     return (
         f"tool {name!r}: radius_m = {radius_m:g} touches about {count:.2g} points {spacing_m:.2g} m apart when pressed in by "
-        f"half of it, its force depends on where between the points it presses; expected {FEWEST_POINTS:g} or more, as with "
+        f"half of it, its force ripples by 6 % or more while it slides over them; expected {FEWEST_POINTS:g} or more, as with "
         f"a spacing_m of {fit:.2g} or a radius_m of {radius_m * math.sqrt(FEWEST_POINTS / count):.2g}"
+    )
+
+
+def ripple_note(radius_m: float, spacing_m: float) -> str | None:
+    """A sentence for a tool that touches enough points, spacing_m apart, but feels them while it slides; else None."""
+    radius = contact_radius_m(radius_m)
+    if radius >= SMOOTH_FROM * spacing_m or points_in_contact(radius_m, spacing_m) < FEWEST_POINTS:
+        return None
+    return (
+        f"force of a sliding tip with radius_m = {radius_m:g} ripples by up to 6 %, by less than 2 % with a spacing_m of "
+        f"{radius / SMOOTH_FROM:.2g}"
     )

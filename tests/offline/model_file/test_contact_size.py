@@ -12,6 +12,7 @@ from palpate.model_file.contact_size import (
     coarse_advice,
     point_areas,
     point_spacing,
+    ripple_note,
 )
 from palpate_server.diagnostics.sample_surface import half_space_model
 from palpate_server.simulation import Simulation
@@ -69,3 +70,13 @@ def test_a_tool_is_held_between_points_that_are_near_enough() -> None:
         reaction = simulation.step({"tip": (0.0, 0.0, height)})["tip"]
     assert reaction.n_points == 4
     assert reaction.force_n[2] > 0
+
+
+@pytest.mark.parametrize(
+    ("spacing_m", "noted"), [(0.004, False), (0.003, True), (0.0022, True), (0.002, False)]
+)
+def test_a_tip_that_feels_the_points_while_it_slides_is_told_of(spacing_m: float, noted: bool) -> None:
+    """Radius 5 mm: too few points at 4 mm, which is warned of; the contact has 1.2, 1.6 and 1.8 spacings at 3, 2.2 and 2 mm."""
+    text = ripple_note(0.005, spacing_m)
+    assert (text is not None) == noted
+    assert text is None or "ripples by up to 6 %, by less than 2 % with a spacing_m of 0.0021" in text
