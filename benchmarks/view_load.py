@@ -19,13 +19,14 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from playwright.sync_api import Page, sync_playwright
 
-from palpate.model_file import ToolShape, save_model
+from palpate.model_file import SurfaceAccuracy, ToolShape, save_model
 from palpate_client import Connection
 from palpate_client.local_server import free_endpoint, running
 from palpate_server.diagnostics.sample_surface import half_space_model
@@ -65,7 +66,11 @@ def main() -> None:
 
 def sample(folder: Path) -> Path:
     path = folder / "sample.npz"
-    save_model(half_space_model([ToolShape("tip", 0.005, 0.3, (0.0, 0.0, 0.02))], n_modes=6), path)
+    model = half_space_model([ToolShape("tip", 0.005, 0.3, (0.0, 0.0, 0.02))], n_modes=6)
+    zeros = dict.fromkeys((field.name for field in fields(SurfaceAccuracy)), 0.0)
+    accuracy = SurfaceAccuracy(**zeros | {"error_map": np.zeros(model.n_points, np.float32)})
+    model = replace(model, n_nodes=model.n_points, accuracy=accuracy, built_with="a benchmark")
+    save_model(model, path)
     return path
 
 

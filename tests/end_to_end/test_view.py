@@ -104,14 +104,16 @@ def close(page: Any) -> int:
     blank = context.new_page()  # of the same origin, which has the note
     blank.route("**/note", lambda route: route.fulfill(body="<html></html>", content_type="text/html"))
     blank.goto(f"{address.rstrip('/')}/note")
-    closed_ms = float(blank.evaluate("localStorage.getItem('closed_ms')"))
+    note = blank.wait_for_function("localStorage.getItem('closed_ms')")  # the browser stores it by and by
+    closed_ms = float(note.json_value())
     context.close()
     return round(closed_ms * 1e6) - offset_ns
 
 
 def colored_pixels(picture: Path) -> int:
-    """How many pixels have the colors of tissue that is displaced by a third of the scale and more."""
-    r, g, b = np.moveaxis(np.asarray(Image.open(picture).convert("RGB"), int), 2, 0)
+    """How many pixels between the panels have the colors of tissue that is displaced by a third of the scale and more."""
+    between = Image.open(picture).convert("RGB").crop((320, 0, 720, 600))
+    r, g, b = np.moveaxis(np.asarray(between, int), 2, 0)
     return int(np.count_nonzero((r > 200) & (g > 120) & (g < r) & (b < 0.75 * g)))
 
 
@@ -237,6 +239,7 @@ def test_buttons_record_and_load_another_model(
     connect: Callable[..., Any],
     make_surface_model: Callable[..., SurfaceModel],
     make_spring_mass_model: Callable[..., Any],
+    wait_for: Callable[..., Any],
     tmp_path: Path,
 ) -> None:
     recordings = tmp_path / "recordings"
@@ -250,7 +253,7 @@ def test_buttons_record_and_load_another_model(
         ]
         page.get_by_role("button", name="Stop recording").click()
         client.status_when(lambda status: status["recording"] is None, "the end of the recording")
-        assert (recordings / recording["file"]).stat().st_size > 0
+        wait_for(lambda: (recordings / recording["file"]).stat().st_size, "the recording's end")
         choose(page, "Model", "model1.npz")  # the one that runs
         factor = page.get_by_label("Stiffness", exact=True).first
         factor.fill("3")
