@@ -165,14 +165,14 @@ class Simulation:
 
 
 def _position(name: str, values: Iterable[float]) -> Floats:
-    given = values if isinstance(values, np.ndarray) else list(values)
     try:
-        position = np.asarray(given, float)
+        values = values if isinstance(values, np.ndarray) else list(values)
+        position = np.asarray(values, float)
     except (TypeError, ValueError):
         position = np.zeros(0)
     if position.shape != (3,) or not np.all(np.abs(position) <= MAX_POSITION_M):
         raise ValueError(
-            f"position of {name!r} is {given!r}: expected three finite numbers, in m, up to {MAX_POSITION_M:g}"
+            f"position of {name!r} is {values!r}: expected three finite numbers, in m, up to {MAX_POSITION_M:g}"
         )
     return position
 

@@ -230,7 +230,7 @@ def shown(model: SurfaceModel, state: Floats) -> NDArray[np.float32]:
     prewarp = 2 / model.period_s * np.tan(frequency * model.period_s / 2) / frequency
     q, y = (state[:r] * prewarp).astype(np.float32), state[-3 * model.n_points :].astype(np.float32)
     pressed = np.flatnonzero(y)
-    return model.shapes.reshape(-1, r) @ q + model.residual[:, pressed] @ y[pressed]
+    return model.shapes.reshape(3 * model.n_points, r) @ q + model.residual[:, pressed] @ y[pressed]
 
 
 # For compiled code.
