@@ -94,18 +94,9 @@ def surface_body(
 ) -> SurfaceBody:
     """The assembled body and the points that are touched. Arguments and errors as `build_surface_model`."""
     material, keys = config.material.material(), stage_keys(config, folder)
-    progress("node cloud")
-    cloud, warnings = cache.kept("cloud", keys.cloud, lambda: cloud_and_warnings(config, folder))
-    for text in (*warnings, *plausibility(config, float(np.max(np.ptp(cloud.points, axis=0))))):
-        progress.warn(text)
-    cloud = with_inclusions(config, folder, cloud, progress.warn)
-    fixed = fixed_nodes(config, cloud)
-    progress.note(
-        f"{cloud.n_nodes:,} nodes, {int(cloud.boundary.sum()):,} on the surface, {len(fixed)} fixed"
-    )
+    cloud, fixed = surface_cloud(config, folder, progress, cache)
     support = config.discretization.support_radius
-    guess = _guess(config, cloud)
-    needed = _require_memory(cloud, guess, support)
+    needed = _require_memory(config, cloud)
     progress("assembly, conservative")
     unit = cache.kept(
         "body", keys.body, lambda: conservative.assemble(cloud, material.unit, fixed, [], support)
@@ -115,6 +106,23 @@ def surface_body(
     touched = _touched(config, cloud, fixed, body.basis.value)
     key = key_of(keys.surface, fingerprint(config, folder))
     return SurfaceBody(cloud, touched, functools.cache(lambda: hold(body, fixed)), key)
+
+
+def surface_cloud(
+    config: Config, folder: Path, progress: Progress = NO_PROGRESS, cache: StageCache = NO_CACHE
+) -> tuple[NodeCloud, NDArray[np.int64]]:
+    """The nodes with the stiffness of their inclusions, and those that are fixed. Arguments and errors as `build_surface_model`."""
+    keys = stage_keys(config, folder)
+    progress("node cloud")
+    cloud, warnings = cache.kept("cloud", keys.cloud, lambda: cloud_and_warnings(config, folder))
+    for text in (*warnings, *plausibility(config, float(np.max(np.ptp(cloud.points, axis=0))))):
+        progress.warn(text)
+    cloud = with_inclusions(config, folder, cloud, progress.warn)
+    fixed = fixed_nodes(config, cloud)
+    progress.note(
+        f"{cloud.n_nodes:,} nodes, {int(cloud.boundary.sum()):,} on the surface, {len(fixed)} fixed"
+    )
+    return cloud, fixed
 
 
 def surface_modes(
@@ -180,21 +188,26 @@ def _touched(config: Config, cloud: NodeCloud, fixed: NDArray[np.int64], value: 
     )
 
 
-def _require_memory(cloud: NodeCloud, n_modes: int, support_radius_factor: float) -> float:
-    """Bytes that the build needs at its peak. Raises MemoryError where the machine has less."""
-    n, n_points = 3 * cloud.n_nodes, int(cloud.boundary.sum())
-    stiffness = stiffness_memory(cloud.n_nodes, support_radius_factor)
-    factor = factor_memory(cloud.n_nodes, support_radius_factor)
+def memory_needed(config: Config, cloud: NodeCloud) -> float:
+    """Bytes that the build needs at its peak, about."""
+    n, n_points, n_modes = 3 * cloud.n_nodes, int(cloud.boundary.sum()), _guess(config, cloud)
+    support = config.discretization.support_radius
+    stiffness = stiffness_memory(cloud.n_nodes, support)
+    factor = factor_memory(cloud.n_nodes, support)
     space = 2 * 8 * n * _SURFACE_SOLVES * n_modes
-    needed = (
+    return (
         0.5 * 2**30
         + stiffness
         + max(4 * stiffness, factor + max(space, residual_memory(n, n_points, n_modes)))
     )
-    present = machine_memory()
+
+
+def _require_memory(config: Config, cloud: NodeCloud) -> float:
+    """As `memory_needed`. Raises MemoryError where the machine has less."""
+    needed, present = memory_needed(config, cloud), machine_memory()
     if needed > present:
         raise MemoryError(
-            f"the surface model of {cloud.n_nodes:,} nodes, {n_points:,} of them on the surface, needs about "
+            f"the surface model of {cloud.n_nodes:,} nodes, {int(cloud.boundary.sum()):,} of them on the surface, needs about "
             f"{needed / 2**30:.1f} GiB, this machine has {present / 2**30:.1f}: expected a larger surface.spacing_m or a "
             "smaller surface.working_area"
         )

@@ -16,6 +16,7 @@ from palpate import interrupts
 from palpate.stages import stage_reporter
 
 if TYPE_CHECKING:
+    from palpate.scene.schema import Config
     from palpate.stage_cache import StageCache
 
 
@@ -32,12 +33,7 @@ def build() -> None:
     tolerance = None if options.tolerance is None else parse_tolerance(options.tolerance)
     scene = override_reduction(load_config(options.scene), options.method, options.order, tolerance)
     if options.dry_run:
-        from palpate.expected import expectation_json, expectation_text
-
-        folder = options.scene.parent
-        print(
-            json.dumps(expectation_json(scene, folder)) if options.json else expectation_text(scene, folder)
-        )
+        _print_expectation(scene, options)
         return
     path = options.output or Path(f"{scene.name}.npz")
     inputs = [options.scene]
@@ -63,6 +59,21 @@ def build() -> None:
     print(f"\nwrote {path} ({path.stat().st_size / 2**20:.1f} MiB) in {seconds:.0f} s")
 
 
+def _print_expectation(scene: Config, options: argparse.Namespace) -> None:
+    with interrupts.ends_at_once():
+        from palpate.expected import expectation_json, expectation_text, expected_surface_model
+
+    folder = options.scene.parent
+    if not scene.tool:
+        print(
+            json.dumps(expectation_json(scene, folder)) if options.json else expectation_text(scene, folder)
+        )
+        return
+    with stage_reporter(to_stderr=options.json) as stages:
+        expected = expected_surface_model(scene, folder, stages, chosen_cache(options))
+    print(json.dumps(asdict(expected)) if options.json else expected.text())
+
+
 def _build_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=build.__doc__)
     parser.add_argument("scene", type=Path, help="a TOML file such as configs/liver.toml")
@@ -81,7 +92,7 @@ def _build_options() -> argparse.Namespace:
     parser.add_argument(
         "--dry-run",
         action="store_true",
-        help="say how many nodes, how much time and memory, and build nothing",
+        help="say how many nodes and how much memory, for a scene with contacts how much time too, and build nothing",
     )
     add_cache_options(parser)
     parser.add_argument("--verbose", action="store_true", help="all figures of the accuracy report")

@@ -58,7 +58,7 @@ def with_inclusions(config: Config, folder: Path, cloud: NodeCloud, warn: Callab
         if abs(held / volume - 1) > _LARGEST_LOSS:
             warn(
                 f"inclusion[{index}]: {held * 1e6:.3g} cm³ of the nodes' cells lie in it, its volume is {volume * 1e6:.3g} cm³: "
-                "expected it within the body, and a spacing_m of a third of its thickness or less"
+                + _likely_cause(inclusion, cloud)
             )
         stiffness *= (inclusion.relative_stiffness / stiffness) ** inside
     return replace(cloud, relative_stiffness=stiffness)
@@ -77,6 +77,18 @@ def finer_around_inclusions(config: Config, folder: Path) -> tuple[RefinedArea, 
         for index, inclusion in enumerate(config.inclusion)
         if inclusion.spacing_m is not None
     )
+
+
+def _likely_cause(inclusion: Inclusion, cloud: NodeCloud) -> str:
+    """Why the cells inside are not as large as the inclusion."""
+    spacing = "a spacing_m of a third of its thickness or less"
+    if not isinstance(inclusion, SphereInclusion):
+        return f"expected it within the body, and {spacing}"
+    depth = float(depth_inside(np.array([inclusion.center_m]), cloud.surface)[0])
+    if depth >= inclusion.radius_m:
+        return f"expected {spacing}"
+    side = "inside" if depth >= 0 else "outside"
+    return f"center_m is {abs(depth):.2g} m {side} the body: expected it at least radius_m = {inclusion.radius_m:g} inside"
 
 
 def _depth_and_volume(inclusion: Inclusion, folder: Path, points: Array) -> tuple[Array, float]:

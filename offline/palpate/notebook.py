@@ -177,7 +177,12 @@ def plot_error_map(model: SurfaceModel) -> Figure:
 
 
 def plot_response(model: ReducedModel) -> Figure:
-    """Bode magnitude: the largest singular value of the force response, full and as it runs, up to half the sampling rate."""
+    """Bode magnitude: the largest singular value of the force response, full and as it runs, up to half the sampling rate.
+
+    Raises ValueError for a surface model.
+    """
+    if isinstance(model, SurfaceModel):
+        raise ValueError(f"{model.name!r} is a surface model: plot_response expects a model with [[contact]]")
     highest = 0.5 / model.period_s
     frequencies = np.geomspace(1e-3 * model.accuracy.band_hz[1], 0.999 * highest, 500)
     omega = 2 * np.pi * frequencies

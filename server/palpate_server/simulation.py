@@ -67,12 +67,17 @@ class Simulation:
     model                a surface model
     stiffness_n_per_m    of the coupling spring between each tool's position and its sphere: of all tools, or by name
 
-    Raises ValueError for a stiffness that is out of range, and for modes above half the sampling rate.
+    Raises TypeError for another kind of model, ValueError for a stiffness that is out of range, and for modes above half the
+    sampling rate.
     """
 
     def __init__(
         self, model: SurfaceModel, stiffness_n_per_m: float | Mapping[str, float] = DEFAULT_STIFFNESS_N_PER_M
     ) -> None:
+        if not isinstance(model, SurfaceModel):
+            raise TypeError(
+                f"model is a {type(model).__name__}: expected a SurfaceModel, built from a scene with [[tool]]"
+            )
         self.model = model
         self._index = {tool.name: i for i, tool in enumerate(model.tools)}
         self._contact = spheres.make(model, self._stiffnesses(stiffness_n_per_m))

@@ -1,14 +1,25 @@
 """What a build is said to take, before it takes it."""
 
+import copy
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from palpate_configs import __file__ as configs
 
 from palpate.build import build_model
-from palpate.expected import BodySize, expectation_text, expected_size, expected_stages, require_memory
+from palpate.expected import (
+    BodySize,
+    expectation_text,
+    expected_size,
+    expected_stages,
+    expected_surface_model,
+    require_memory,
+)
+from palpate.geometry.ply import ply_bytes
+from palpate.geometry.shapes import box_lattice
 from palpate.scene.schema import check_config
 from palpate.scene_cloud import build_cloud
 
@@ -62,3 +73,57 @@ def test_the_dry_run_names_nodes_unknowns_and_stages():
     text = expectation_text(*liver(0.0049))
     for part in ("nodes", "unknowns", "node cloud", "assembly", "modes, Ritz", "GiB"):
         assert part in text
+
+
+BLOCK: dict[str, Any] = tomllib.loads("""
+name = "block"
+[geometry]
+shape = "surface"
+file = "block.ply"
+spacing_m = 0.015
+[material]
+preset = "liver"
+[[fixed]]
+region = "plane"
+point_m = [0.0, 0.0, 0.001]
+normal = [0.0, 0.0, -1.0]
+[surface]
+band_hz = [0.0, 15.0]
+spacing_m = 0.01
+[[surface.working_area]]
+region = "sphere"
+center_m = [0.0, 0.0, 0.04]
+radius_m = 0.02
+[[tool]]
+name = "tip"
+radius_m = 0.016
+friction = 0.3
+""")
+
+
+@pytest.fixture
+def block_folder(tmp_path):
+    block = box_lattice((-0.04, -0.04, 0.0), (0.04, 0.04, 0.04), (5, 5, 3)).surface
+    (tmp_path / "block.ply").write_bytes(ply_bytes(block.vertices, block.triangles))
+    return tmp_path
+
+
+def test_the_dry_run_of_a_scene_with_tools_counts_nodes_and_points(block_folder, monkeypatch):
+    config = check_config(BLOCK, "block")
+    cloud = build_cloud(config, block_folder)
+    expected = expected_surface_model(config, block_folder)
+    assert (expected.n_nodes, expected.n_points) == (cloud.n_nodes, cloud.boundary.sum())
+    assert 0.5 * 2**30 < expected.peak_bytes < 2**30
+    assert f"{3 * cloud.n_nodes:,} unknowns" in expected.text()
+    assert "smaller surface.working_area" not in expected.text()
+    monkeypatch.setattr("palpate.expected.machine_memory", lambda: 2**28)
+    assert "smaller surface.working_area" in expected_surface_model(config, block_folder).text()
+
+
+def test_the_dry_run_of_a_scene_with_tools_finds_the_mistakes_that_the_build_finds(block_folder):
+    tables = copy.deepcopy(BLOCK)
+    tables["surface"]["working_area"][0]["center_m"] = [0.0, 0.0, 0.5]
+    with pytest.raises(ValueError, match=r"surface.working_area\[0\]: holds nothing of the surface"):
+        expected_surface_model(check_config(tables, "block"), block_folder)
+    with pytest.raises(FileNotFoundError, match=r"block\.ply"):
+        expected_surface_model(check_config(BLOCK, "block"), block_folder / "elsewhere")

@@ -151,8 +151,11 @@ def test_an_inclusion_outside_the_body_is_refused_and_one_half_outside_is_told(
     ):
         with_inclusions(outside, folder, cloud, no_warning)
     warned: list[str] = []
-    with_inclusions(check_config(changed(center_m=[0.0, 0.0, 0.04]), "scene"), folder, cloud, warned.append)
-    assert "expected it within the body" in warned[0]
+    for height in (0.036, 0.043):
+        scene = check_config(changed(center_m=[0.0, 0.0, height]), "scene")
+        with_inclusions(scene, folder, cloud, warned.append)
+    assert "center_m is 0.004 m inside the body: expected it at least radius_m = 0.008 inside" in warned[0]
+    assert "center_m is 0.003 m outside the body" in warned[1]
 
 
 @pytest.mark.parametrize(

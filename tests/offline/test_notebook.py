@@ -106,3 +106,8 @@ def test_a_notebook_shows_models_and_figures(folder, make_surface_model):
     assert "verdict" in formatters["text/html"][ReducedModel](model)
     assert "points to touch" in formatters["text/html"][SurfaceModel](make_surface_model())
     assert formatters["image/png"][Figure](notebook.plot_response(model)).startswith(b"\x89PNG")
+
+
+def test_the_response_of_a_surface_model_is_refused(make_surface_model):
+    with pytest.raises(ValueError, match=r"is a surface model: plot_response expects"):
+        notebook.plot_response(make_surface_model())

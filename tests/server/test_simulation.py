@@ -44,3 +44,8 @@ def test_a_stiffness_without_a_usable_compliance_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=r"^stiffness_n_per_m = .*: expected 1e-06 to 1e\+12"):
         Simulation(make_surface_model(), {"tip": stiffness})
+
+
+def test_a_patch_model_is_refused(make_spring_mass_model: Callable[..., Any]) -> None:
+    with pytest.raises(TypeError, match=r"^model is a ReducedModel: expected a SurfaceModel"):
+        Simulation(make_spring_mass_model())

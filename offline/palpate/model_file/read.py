@@ -55,12 +55,13 @@ _NPY_HEADER = re.compile(
 Part = TypeVar("Part")
 
 
-def load_model(path: Path) -> ReducedModel | SurfaceModel:
+def load_model(path: str | Path) -> ReducedModel | SurfaceModel:
     """Read and check a model file. Memory stays within twice `MAX_TOTAL_BYTES`, whatever the file holds.
 
     Raises FileNotFoundError if there is none, OSError if it can't be opened, and ModelFileError, in one line that names
     the field, if it is damaged, cut short, foreign, of another schema, or inconsistent in itself.
     """
+    path = Path(path)
     shown = printable(path)
     if not path.is_file():
         raise missing(path, "model file")
@@ -79,7 +80,7 @@ def load_model(path: Path) -> ReducedModel | SurfaceModel:
     return model
 
 
-def load_patch_model(path: Path) -> ReducedModel:
+def load_patch_model(path: str | Path) -> ReducedModel:
     """Read a model whose tools are bound to patches. Raises as `load_model`, and ModelFileError for another kind."""
     model = load_model(path)
     if isinstance(model, SurfaceModel):

@@ -219,3 +219,7 @@ def test_metadata_that_is_no_table_is_refused(
     pack(tmp_path / "odd.npz", metadata, {})
     with pytest.raises(ModelFileError, match=says):
         load_model(tmp_path / "odd.npz")
+
+
+def test_a_path_may_be_text(model_path: Path) -> None:
+    assert load_model(str(model_path)).name == load_model(model_path).name
