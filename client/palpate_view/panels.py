@@ -45,7 +45,7 @@ _CHARTS = (
             Line("tissue_j", "in the tissue", "#ff7a70", 1e3),
             Line("lost_j", "lost", "#8fa1b3", 1e3),
             Line("spring_j", "in the spring", "#7ee081", 1e3),
-            Line("withheld_j", "withheld", "#c792ea", 1e3),
+            Line("withheld_j", "withheld, not in the sum", "#c792ea", 1e3),
         ],
     ),
     (

@@ -73,8 +73,8 @@ def coarse_advice(points: Floats, triangles: NDArray[np.int32], radius_m: float)
         return None
     largest = float(blunted_radius_m(points, triangles, radius_m).max())
     return (
-        f"the points of {100 * share:.2g} % of the surface are near enough for radius_m = {radius_m:g}; elsewhere it acts as a "
-        f"blunter one, of up to {largest:.2g} m"
+        f"where points are far apart, as outside the working areas, a tip of radius_m = {radius_m:g} acts as a blunter one, of up "
+        f"to {largest:.2g} m; they are near enough on {100 * share:.2g} % of the surface"
     )
 
 

@@ -90,7 +90,7 @@ def settings() -> list[Finding]:
     """Settings of the kernel and limits of the user. A setting is never worse than marginal."""
     cpus = len(os.sched_getaffinity(0))
     load = os.getloadavg()[0] / cpus
-    real_time = _read("/sys/kernel/realtime") == "1"
+    real_time = _has_real_time_kernel()
     governor = _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
     refusal = _try_priority()
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
@@ -124,6 +124,20 @@ def _read(path: str) -> str | None:
     return Path(path).read_text().strip() if Path(path).is_file() else None
 
 
+def _has_real_time_kernel() -> bool:
+    return _read("/sys/kernel/realtime") == "1"
+
+
+def _for_late_ticks() -> str:
+    """Advice, without what this machine has."""
+    parts = ["stop other programs"]
+    if not _has_real_time_kernel():
+        parts.append("use a real-time kernel")
+    if _try_priority() is not None:
+        parts.insert(0, "allow real-time priority")
+    return ", ".join(parts)
+
+
 def _try_priority() -> str | None:
     result: list[str | None] = []
     thread = threading.Thread(target=lambda: result.append(threads.raise_priority()))
@@ -153,7 +167,7 @@ def tick_run(path: Path, seconds: float) -> list[Finding]:
             timer["p50"],
             timer["p99"],
             TIMER_LATENESS_P99_S,
-            "allow real-time priority, use a real-time kernel, stop other programs",
+            _for_late_ticks(),
         ),
         _duration(
             "tick computation",
@@ -164,7 +178,7 @@ def tick_run(path: Path, seconds: float) -> list[Finding]:
         ),
         _round_trip("command to force", trips, "see timer and round trip"),
         _unanswered("unanswered commands", trips, "see timer and round trip"),
-        _share("late ticks", late, LATE_SHARE, "allow real-time priority"),
+        _share("late ticks", late, LATE_SHARE, _for_late_ticks()),
         _share("skipped ticks", skipped, SKIPPED_SHARE, "stop other programs"),
     ]
 
@@ -198,7 +212,9 @@ def under_load(path: Path, seconds: float = _LOAD_S) -> Finding:
         f"{'lost' if lost.is_set() else 'kept'}, longest silence {silence_s:.3f} s of a lease of {lease_s:g} s",
         {"lost": lost.is_set(), "longest_silence_s": silence_s, "lease_s": lease_s},
         NOT_SUFFICIENT if lost.is_set() else SILENCE_IN_LEASES.judge(silence_s / lease_s),
-        "allow real-time priority, so that Zenoh's threads get it too; stop other programs",
+        "stop other programs"
+        if _try_priority() is None
+        else "allow real-time priority, so that Zenoh's threads get it too; stop other programs",
     )
 
 

@@ -41,8 +41,8 @@ def test_the_share_of_the_surface_with_points_near_enough_is_one_of_area() -> No
     assert coarse_advice(fine, triangles, 5e-3) is None
     text = coarse_advice(points, both, 5e-3)
     assert text is not None
-    assert text.endswith(
-        "of the surface are near enough for radius_m = 0.005; elsewhere it acts as a blunter one, of up to 0.017 m"
+    assert text.startswith(
+        "where points are far apart, as outside the working areas, a tip of radius_m = 0.005 acts as a blunter one, of up to 0.017 m"
     )
 
 

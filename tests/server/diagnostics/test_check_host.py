@@ -47,6 +47,29 @@ def test_settings_alone_never_make_a_machine_insufficient() -> None:
     assert all(finding.advice for finding in findings if finding.verdict != GOOD)
 
 
+@pytest.mark.parametrize("refusal", [None, "no real-time scheduling"])
+def test_what_is_allowed_is_not_advised(
+    refusal: str | None,
+    tmp_path: Path,
+    make_surface_model: Callable[..., SurfaceModel],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    status = {
+        "timer_lateness_s": {"p50": 1.0, "p99": 1.0},
+        "compute_time_s": {"p50": 0.0, "p99": 0.0},
+        "ticks": 1,
+        "late_ticks": 1,
+        "skipped_ticks": 0,
+    }
+    monkeypatch.setattr(check_host, "through_a_model", lambda *_, **__: (RoundTrips(0.0, 0.0, 0.0), status))
+    monkeypatch.setattr(check_host, "_try_priority", lambda: refusal)
+    save_model(make_surface_model(), tmp_path / "model.npz")
+    advice = {f.name: f.advice for f in check_host.tick_run(tmp_path / "model.npz", 1.0)}
+    for name in ("timer lateness", "late ticks"):
+        assert ("allow real-time priority" in advice[name]) == (refusal is not None)
+        assert "stop other programs" in advice[name]
+
+
 @pytest.mark.parametrize(
     ("unanswered", "verdict"), [(0.0, GOOD), (0.01, GOOD), (0.05, MARGINAL), (0.5, NOT_SUFFICIENT)]
 )
