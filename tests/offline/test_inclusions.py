@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from palpate.expected import expected_size
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.fill import fill_surface
 from palpate.geometry.ply import ply_bytes
+from palpate.geometry.sampling import depth_inside
 from palpate.geometry.shapes import ball, box_lattice
 from palpate.geometry.spacing import RefinedArea
 from palpate.geometry.surface import load_surface
@@ -235,3 +237,13 @@ def test_an_inclusion_changes_the_force_map_as_finite_elements_say(
     without = stiffness_along_x(cloud)
     found = stiffness_along_x(with_inclusions(config, folder, cloud, no_warning)) / without - 1
     np.testing.assert_allclose(100 * found, CHANGES[relative], rtol=tolerance)
+
+
+def test_the_inclusion_that_the_readme_shows_lies_in_the_liver() -> None:
+    root = Path(__file__).parents[2]
+    (table,) = re.findall(
+        r"^```toml\n(\[\[inclusion\]\].*?)^```$", (root / "README.md").read_text(), re.MULTILINE | re.DOTALL
+    )
+    (inclusion,) = tomllib.loads(table)["inclusion"]
+    liver = load_surface(root / "configs" / "liver.ply", "m").surface
+    assert depth_inside(np.array([inclusion["center_m"]]), liver)[0] > inclusion["radius_m"]
