@@ -22,6 +22,8 @@ from scipy.optimize import nnls
 from scipy.sparse import csr_array
 
 from palpate.discretization import conservative
+from palpate.geometry.node_surface import node_surface
+from palpate.model_file.contact_size import point_spacing, smallest_radius_m
 from palpate.modes.dense import elastic_modes
 from palpate.scene.schema import Config
 from palpate.scene_cloud import build_cloud, fixed_nodes
@@ -34,10 +36,11 @@ _REACH_M = 2e-3  # of a gap: points farther away are not solved for
 
 @dataclass(frozen=True)
 class FullBody:
-    """points, normals (m, 3), at rest; squared_frequencies (n,), (rad/s)²; shapes (m, 3, n), kg^-1/2; gamma, tau_s (t,)"""
+    """points, normals (m, 3), at rest; spacing (m,), m, of the points around each; squared_frequencies (n,), (rad/s)²; shapes (m, 3, n), kg^-1/2; gamma, tau_s (t,)"""
 
     points: Floats
     normals: Floats
+    spacing: Floats
     squared_frequencies: Floats
     shapes: Floats
     gamma: Floats
@@ -64,6 +67,7 @@ def full_body(config: Config, folder: Path = Path()) -> FullBody:
     return FullBody(
         points=cloud.points[nodes],
         normals=cloud.normals[nodes],
+        spacing=point_spacing(cloud.points[nodes], node_surface(cloud).triangles),
         squared_frequencies=np.asarray(modes.squared_frequencies, float),
         shapes=shapes.reshape(len(nodes), 3, -1),
         gamma=np.array(material.prony.gamma),
@@ -79,6 +83,7 @@ def press(body: FullBody, tip: Tip, positions_m: Floats, period_s: float) -> tup
     near = np.flatnonzero(_distance(body.points, positions_m) < 1.5 * tip.radius_m + 0.02)
     points, inward = body.points[near], -body.normals[near]
     shapes = body.shapes[near].reshape(3 * len(near), -1)
+    radii = np.maximum(smallest_radius_m(body.spacing[near]), tip.radius_m)
     free, driven = _propagator(body, period_s)
     compliance = (shapes * driven[0]) @ shapes.T
     state = np.zeros((2 + len(body.tau_s), len(body.squared_frequencies)))
@@ -88,9 +93,9 @@ def press(body: FullBody, tip: Tip, positions_m: Floats, period_s: float) -> tup
     for k, device in enumerate(positions_m):
         state = np.einsum("ijk,jk->ik", free, state)
         unloaded = (shapes @ state[0]).reshape(-1, 3)
-        depth, felt = _sphere(points + drift - center, inward, tip.radius_m)
+        depth, felt = _sphere(points + drift - center, inward, radii)
         height = np.einsum("pi,pi->p", points + displacement - center, inward)
-        gap = height - depth
+        gap = height - (depth - (radii - tip.radius_m))  # a blunter tip has the same lowest point
         closing = np.einsum("pi,pi->p", unloaded - displacement, inward) - felt @ (device - center)
         rows = np.flatnonzero((gap + closing < _REACH_M) & (height > 0) & (depth > 0))
         load = np.zeros((len(near), 3))
@@ -111,8 +116,8 @@ def press(body: FullBody, tip: Tip, positions_m: Floats, period_s: float) -> tup
     return forces, moved
 
 
-def _sphere(away: Floats, inward: Floats, radius: float) -> tuple[Floats, Floats]:
-    """Of points `away` (m, 3) from its center: how far the tip reaches along their inward normals (m,), and the gradient of the gap (m, 3).
+def _sphere(away: Floats, inward: Floats, radius: Floats) -> tuple[Floats, Floats]:
+    """Of points `away` (m, 3) from the center of a sphere, of a radius (m,) for each: how far the tip reaches along their inward normals (m,), and the gradient of the gap (m, 3).
 
     Where a sphere is steeper than 60 degrees, the tip is the cone that touches it there.
     """

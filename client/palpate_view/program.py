@@ -11,6 +11,7 @@ import contextlib
 import io
 import ipaddress
 import signal
+import socket
 import sys
 import threading
 import webbrowser
@@ -114,6 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as under nohup
             signal.signal(number, lambda *_: stop.set())
     try:
+        require_host(options.host)
         connection = connection_for(options)
         with connection:
             view = View(options.host, options.port)
@@ -151,11 +153,30 @@ def show_again(view: View, options: argparse.Namespace, stop: threading.Event) -
             stop.wait(RETRY_S)
 
 
+def require_host(host: str) -> None:
+    """Raises OSError where this machine can't serve at an address: viser would wait for ever."""
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        socket.create_server((host, 0), family=family).close()
+    except OSError as error:
+        raise OSError(f"--host: {host} can't be served from: {error.strerror}") from error
+
+
+def port(text: str) -> int:
+    number = int(text)
+    if not 1 <= number <= 65_535:
+        raise argparse.ArgumentTypeError(f"{number}: expected a port from 1 to 65535")
+    return number
+
+
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="palpate view", description=(__doc__ or "").split("\n\n")[0])
     add_connection_options(parser)
     parser.add_argument(
-        "--port", type=int, default=DEFAULT_PORT, help="of the page, or the next free one (%(default)s)"
+        "--port",
+        type=port,
+        default=DEFAULT_PORT,
+        help="of the page, or the next free one (%(default)s)",
     )
     parser.add_argument(
         "--host",

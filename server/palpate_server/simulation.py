@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -131,8 +132,8 @@ class Simulation:
         return state
 
     def restore(self, state: Floats) -> None:
-        """Continue from a saved state. Raises ValueError for one of another size."""
-        self._contact.restore(state)
+        """Continue from a saved state. Raises ValueError for one that `save` did not write with the same model."""
+        self._contact.restore(np.asarray(state, float))
         self._wanted[:] = self._contact.tools.wanted
 
     def _stiffnesses(self, stiffness: float | Mapping[str, float]) -> list[float]:
@@ -170,11 +171,12 @@ class Simulation:
 
 
 def _position(name: str, values: Iterable[float]) -> Floats:
-    try:
-        values = values if isinstance(values, np.ndarray) else list(values)
-        position = np.asarray(values, float)
-    except (TypeError, ValueError):
-        position = np.zeros(0)
+    position = np.zeros(0)
+    if not isinstance(values, str | bytes | Mapping):
+        with contextlib.suppress(TypeError, ValueError):
+            values = values if isinstance(values, np.ndarray) else list(values)
+            if (given := np.asarray(values)).dtype.kind in "iuf":
+                position = given.astype(float)
     if position.shape != (3,) or not np.all(np.abs(position) <= MAX_POSITION_M):
         raise ValueError(
             f"position of {name!r} is {values!r}: expected three finite numbers, in m, up to {MAX_POSITION_M:g}"

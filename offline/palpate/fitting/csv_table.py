@@ -14,6 +14,8 @@ from palpate.files import printable
 
 MOST_ROWS = 200_000
 
+_LARGEST = 1e15  # SI units; its square is far from the largest number
+
 
 def read_columns(path: Path, allowed: Collection[frozenset[str]]) -> dict[str, NDArray[np.float64]]:
     """The columns of a CSV by name, (n_rows,) each.
@@ -71,7 +73,8 @@ def _numbers(cells: list[str], names: list[str], where: str) -> list[float]:
             number = float(cell)
         except ValueError:
             number = math.nan
-        if not math.isfinite(number):
-            raise ValueError(f"{where}: {name} is {printable(cell.strip(), 40)!r}: expected a number")
+        if not abs(number) <= _LARGEST:
+            expected = "a number" if math.isnan(number) else f"a number up to {_LARGEST:g}"
+            raise ValueError(f"{where}: {name} is {printable(cell.strip(), 40)!r}: expected {expected}")
         numbers.append(number)
     return numbers

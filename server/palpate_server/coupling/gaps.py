@@ -28,7 +28,7 @@ _SINE, _COSINE, _TANGENT = (
     0.5,
     math.sqrt(3.0),
 )  # of 60 degrees, where a sphere's side becomes a cone
-_BLEED_S = 0.05  # time constant with which old penetration is pushed out
+_BLEED_S = 0.01  # time constant with which old penetration is pushed out
 _LARGEST_BLEED_M_PER_S = 0.02
 
 

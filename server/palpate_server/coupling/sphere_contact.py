@@ -4,7 +4,7 @@ Each tick finds the points near each sphere (`gaps`), solves all contacts of all
 advances the body.
 
 Passivity. The same rows, normals and tilts map force and displacement, so the work of the contacts is exact. Contacts may only
-lose energy, or give back what they lost before: old penetration is pushed out with that, at most 1 mJ. Where an iterate that has
+lose energy, or give back what tissue and contacts have dissipated before: old penetration is pushed out with that, at most 1 mJ. Where an iterate that has
 not converged would give out more, all forces are scaled back, to a share a of themselves, with which the loss a p - a² w is not
 below minus that budget. So the work of the tools is what is stored in body and springs plus what is lost, at each tick.
 """
@@ -69,7 +69,7 @@ def advance(
     gaps.fill_matrix(contact)
     contact_solver.solve(contact.rows)
     share = load(contact)
-    elastic_surface.commit(contact.body, share)
+    commit(contact, share)
     keep_forces(contact, share)
     for tool in range(center.shape[0]):
         settle(contact, tool, wanted[tool])
@@ -102,6 +102,16 @@ def load(contact: SphereContact) -> float:
         share = max(share, 0.0)
     contact.budget[0] = min(max(0.0, budget + share * given - share * share * taken), _LARGEST_BUDGET_J)
     return share
+
+
+@compiled
+def commit(contact: SphereContact, share: float) -> None:
+    """Advance the body. What it dissipates is at hand for pushing out penetration."""
+    energy = contact.body.energy
+    before = energy[WORK] - energy[STORED]
+    elastic_surface.commit(contact.body, share)
+    dissipated = energy[WORK] - energy[STORED] - before
+    contact.budget[0] = min(max(0.0, contact.budget[0] + dissipated), _LARGEST_BUDGET_J)
 
 
 @compiled

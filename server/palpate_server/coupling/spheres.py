@@ -79,7 +79,7 @@ class Slots(NamedTuple):
 
 
 class SphereContact(NamedTuple):
-    """A body and the tools on it. budget (1,), J: lost in contacts, for pushing out penetration; tick (1,)."""
+    """A body and the tools on it. budget (1,), J: dissipated before, for pushing out penetration; tick (1,)."""
 
     body: ElasticSurface
     tracking: Tracking
@@ -108,9 +108,19 @@ class SphereContact(NamedTuple):
         return sum(values.size for values in self.arrays())
 
     def restore(self, state: Floats) -> None:
-        """Restore a state that `save` wrote, of a contact with the same model. Raises ValueError for another size."""
+        """Restore a state that `save` wrote, of a contact with the same model. Raises ValueError for anything else."""
         if state.shape != (self.state_size(),):
             raise ValueError(f"state has shape {state.shape}: expected ({self.state_size()},)")
+        if not np.all(np.isfinite(state)):
+            raise ValueError("state: expected finite numbers")
+        place, n_points = 0, len(self.tracking.points)
+        for values in self.arrays():
+            if values.dtype == np.int64:  # compiled code takes them as indices
+                is_point = values is self.body.watched or values is self.tracking.anchor
+                given, last = state[place : place + values.size], n_points if is_point else 2**53
+                if np.any((given != np.floor(given)) | (given < NOBODY) | (given >= last)):
+                    raise ValueError("state: expected one that `save` wrote with the same model")
+            place += values.size
         place = 0
         for values in self.arrays():
             values[...] = state[place : place + values.size].reshape(values.shape)

@@ -72,6 +72,7 @@ def test_other_columns_are_refused_with_what_was_found_and_what_is_expected(
     [
         ("0.1,x,3", "r.csv, line 3: strain is 'x': expected a number"),
         ("0.1,nan,3", "line 3: strain is 'nan'"),
+        ("0.1,1e308,3", "line 3: strain is '1e308': expected a number up to 1e\\+15"),
         ("0.1,2", "line 3: 2 values: expected 3"),
         ("0.1,2,3,4", "line 3: 4 values: expected 3"),
     ],

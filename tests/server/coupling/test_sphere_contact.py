@@ -239,6 +239,22 @@ def test_a_saved_state_continues_with_the_same_bits(soft: SurfaceModel) -> None:
     assert np.abs(one.positions() - soft.points).max() > 1e-3
 
 
+def test_a_state_that_was_not_saved_is_refused(soft: SurfaceModel) -> None:
+    simulation = Simulation(soft)
+    path(simulation, straight((0.0, 0.0, 5e-3), (0.0, 0.0, 2e-3), 60))
+    state = simulation.save()
+    rng = np.random.default_rng(0)
+    for wrong in (
+        state[1:],
+        np.full_like(state, np.nan),
+        rng.normal(size=state.size),
+        np.full_like(state, 1e300),
+    ):
+        with pytest.raises(ValueError, match="state"):
+            simulation.restore(wrong)
+    np.testing.assert_array_equal(simulation.save(), state)
+
+
 def test_one_tool_feels_another_press() -> None:
     tools = [ToolShape(name, 5e-3, 0.0, (x, 0.0, 6e-3)) for name, x in (("a", -6e-3), ("b", 6e-3))]
     simulation = Simulation(half_space_model(tools, 13, 3e-3, YOUNG_PA))
@@ -249,7 +265,20 @@ def test_one_tool_feels_another_press() -> None:
     assert both < 0.95 * alone
 
 
-@pytest.mark.parametrize("position", [(0.0, 0.0), (0.0, 0.0, np.nan), 1.0])
+@pytest.mark.parametrize(
+    "position",
+    [
+        (0.0, 0.0),
+        (0.0, 0.0, np.nan),
+        1.0,
+        "123",
+        b"abc",
+        ["1", "2", "3"],
+        {1: 2},
+        [1j, 0, 0],
+        [10**400, 0, 0],
+    ],
+)
 def test_a_position_is_three_finite_numbers(soft: SurfaceModel, position: object) -> None:
     with pytest.raises(ValueError, match=r"position of 'tip' is .*: expected three finite numbers, in m"):
         Simulation(soft).step({"tip": position})  # type: ignore[dict-item]
