@@ -334,9 +334,5 @@ def test_a_client_feels_pokes_at_20_places_of_the_liver_and_three_slides_as_with
         print(len(error), "ticks:", *(f"{100 * one:.2g} %" for one in found[-1]))
     assert np.count_nonzero(np.array(found)[:, 2]) == 20
     _, in_30_hz, at_rest = np.array(found).T
-    # 5 and 1 % are met where a point is under the tip. Where two points carry it off its axis, the tissue that moves sidewards
-    # opens and closes gaps that a tick does not foresee, and the server leaves some of that as penetration.
-    assert np.count_nonzero(in_30_hz < 0.05) >= 19
-    assert np.max(in_30_hz) < 0.1
-    assert np.median(at_rest[:20]) < 0.01
-    assert np.max(at_rest) < 0.04
+    assert np.max(in_30_hz) < model.accuracy.error_in_band
+    assert np.max(at_rest) < 0.01
