@@ -71,6 +71,7 @@ ROOMS = (
     "expected",
     "build",
     "build_surface",
+    "expected_surface",
     "bank",
     "report",
     "plots",

@@ -61,7 +61,8 @@ def build() -> None:
 
 def _print_expectation(scene: Config, options: argparse.Namespace) -> None:
     with interrupts.ends_at_once():
-        from palpate.expected import expectation_json, expectation_text, expected_surface_model
+        from palpate.expected import expectation_json, expectation_text
+        from palpate.expected_surface import expected_surface_model
 
     folder = options.scene.parent
     if not scene.tool:

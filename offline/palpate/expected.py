@@ -9,7 +9,6 @@ from typing import Any
 
 from scipy.integrate import quad
 
-from palpate.build_surface import memory_needed, surface_cloud
 from palpate.factorization import solver_name
 from palpate.geometry.measures import enclosed_volume, triangle_normals
 from palpate.geometry.spacing import Refinement
@@ -18,10 +17,8 @@ from palpate.inclusions import finer_around_inclusions
 from palpate.memory import machine_memory
 from palpate.modes.body_modes import STEPS_EXPECTED, by_ritz, factor_memory, stiffness_memory
 from palpate.modes.dense import dense_memory
-from palpate.progress import NO_PROGRESS, Progress
 from palpate.scene.schema import BallGeometry, BoxGeometry, Config, SurfaceGeometry
-from palpate.scene_cloud import refinements, tool_shapes
-from palpate.stage_cache import NO_CACHE, StageCache
+from palpate.scene_cloud import refinements
 
 
 @dataclass(frozen=True)
@@ -155,48 +152,3 @@ def expectation_json(config: Config, folder: Path) -> dict[str, Any]:
         "stages": [asdict(stage) for stage in expected_stages(size)],
         "machine_memory_bytes": machine_memory(),
     }
-
-
-_TIME_WITH_TOOLS = (
-    "Time is not estimated for a scene with tools: 3,893 nodes, 1,900 of them on the surface, take five to eight minutes on two "
-    "cores (configs/liver-surface.toml)."
-)
-
-
-@dataclass(frozen=True)
-class ExpectedSurfaceModel:
-    """What `palpate build --dry-run` says of a scene with tools. Nodes and points are counted, memory is estimated."""
-
-    name: str
-    n_nodes: int
-    n_points: int
-    peak_bytes: float
-    machine_memory_bytes: float
-
-    def text(self) -> str:
-        size = (
-            f"{self.name}: {self.n_nodes:,} nodes, {3 * self.n_nodes:,} unknowns, {self.n_points:,} of the nodes on the surface, "
-            "as the points that tools touch"
-        )
-        memory = f"memory about {self.peak_bytes / 2**30:.1f} GiB; this machine has {self.machine_memory_bytes / 2**30:.1f}"
-        if self.peak_bytes > self.machine_memory_bytes:
-            memory += ": expected a larger surface.spacing_m or a smaller surface.working_area"
-        return "\n".join((size, memory, _TIME_WITH_TOOLS))
-
-
-def expected_surface_model(
-    config: Config, folder: Path, progress: Progress = NO_PROGRESS, cache: StageCache = NO_CACHE
-) -> ExpectedSurfaceModel:
-    """What the model of a scene with tools will be. Makes the node cloud, which the build then finds in the cache.
-
-    Raises as `palpate.build_surface.build_surface_model`, but for what comes after the node cloud.
-    """
-    cloud, _ = surface_cloud(config, folder, progress, cache)
-    tool_shapes(config, cloud)
-    return ExpectedSurfaceModel(
-        name=config.name,
-        n_nodes=cloud.n_nodes,
-        n_points=int(cloud.boundary.sum()),
-        peak_bytes=memory_needed(config, cloud),
-        machine_memory_bytes=machine_memory(),
-    )

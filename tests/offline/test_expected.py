@@ -15,9 +15,9 @@ from palpate.expected import (
     expectation_text,
     expected_size,
     expected_stages,
-    expected_surface_model,
     require_memory,
 )
+from palpate.expected_surface import expected_surface_model
 from palpate.geometry.ply import ply_bytes
 from palpate.geometry.shapes import box_lattice
 from palpate.scene.schema import check_config
@@ -116,7 +116,7 @@ def test_the_dry_run_of_a_scene_with_tools_counts_nodes_and_points(block_folder,
     assert 0.5 * 2**30 < expected.peak_bytes < 2**30
     assert f"{3 * cloud.n_nodes:,} unknowns" in expected.text()
     assert "smaller surface.working_area" not in expected.text()
-    monkeypatch.setattr("palpate.expected.machine_memory", lambda: 2**28)
+    monkeypatch.setattr("palpate.expected_surface.machine_memory", lambda: 2**28)
     assert "smaller surface.working_area" in expected_surface_model(config, block_folder).text()
 
 

@@ -16,6 +16,7 @@ from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.node_surface import node_surface
 from palpate.geometry.shapes import box_lattice
 from palpate.model_file import SurfaceAccuracy, SurfaceModel
+from palpate.model_file.surface_model import SAMPLE_SIZE
 from palpate.modes.compliance import static_compliance
 from palpate.modes.dense import elastic_modes
 from palpate.modes.held_body import HeldBody, hold
@@ -30,7 +31,7 @@ from palpate.surface_model.reference import reference_model
 from palpate.surface_model.residual import Residual, modal_compliance, residual
 from palpate.surface_model.ritz_vectors import Added, added, dominant_fields
 from palpate.surface_model.rounding import rounded
-from palpate.surface_model.sample import SIZE, Sample, exact_compliance, sample_footprints
+from palpate.surface_model.sample import Sample, exact_compliance, sample_footprints
 
 LIVER = PRESETS["liver"]
 RADIUS_M = 0.012
@@ -146,7 +147,7 @@ def test_a_sample_has_points_inside_and_outside_of_the_working_areas(block: Bloc
     """Of many points three quarters are inside, of few all."""
     alone = csr_array(eye_array(300))
     some = sample_footprints(alone, alone, np.arange(290), np.arange(200))
-    assert len(some.points) == SIZE == len(set(some.points.tolist()))
+    assert len(some.points) == SAMPLE_SIZE == len(set(some.points.tolist()))
     assert np.count_nonzero(some.working) == 153
     few = sample_footprints(block.rows, block.footprints, block.free[:20], block.free[:5])
     np.testing.assert_array_equal(few.points, block.free[:20])

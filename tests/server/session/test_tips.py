@@ -76,7 +76,7 @@ def test_a_model_that_is_loaded_brings_its_own_tips_except_for_what_was_asked_fo
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(loading, "load_model_elsewhere", lambda path, _: load_model(path))  # quicker here
+    monkeypatch.setattr(loading, "load_model_elsewhere", lambda path, *_: load_model(path))  # quicker here
     other = make_surface_model(2)
     other = replace(other, tools=tuple(replace(tool, radius_m=0.0048, friction=0.2) for tool in other.tools))
     save_model(other, tmp_path / "other.npz")
