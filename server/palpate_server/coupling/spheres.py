@@ -149,8 +149,8 @@ def make(
     spacing = point_spacing(model.points, model.triangles)
     carried = smallest_radius_m(spacing)
     largest = max((tool.radius_m for tool in model.tools), default=0.0)
-    # Half around the sphere, and a few points more.
-    near = _near(model, largest, 1.25 * np.maximum(largest, carried) + spacing)
+    # Half around the sphere, and a few points more; where points are sparse those that an edge connects.
+    near = _near(model, largest, np.full(len(spacing), 1.25 * largest + float(np.median(spacing))))
     contact = _assemble(model, near, carried, n, n * (near.shape[1] + _SPARE_SLOTS), sweeps)
     stiffness = np.broadcast_to(np.asarray(stiffness_n_per_m, float), (n,))
     for i, tool in enumerate(model.tools):
