@@ -23,7 +23,7 @@ from scipy.sparse import csr_array
 
 from palpate.discretization import conservative
 from palpate.geometry.node_surface import node_surface
-from palpate.model_file.contact_size import point_spacing, smallest_radius_m
+from palpate.model_file.contact_size import blunted_radius_m
 from palpate.modes.dense import elastic_modes
 from palpate.scene.schema import Config
 from palpate.scene_cloud import build_cloud, fixed_nodes
@@ -36,11 +36,11 @@ _REACH_M = 2e-3  # of a gap: points farther away are not solved for
 
 @dataclass(frozen=True)
 class FullBody:
-    """points, normals (m, 3), at rest; spacing (m,), m, of the points around each; squared_frequencies (n,), (rad/s)²; shapes (m, 3, n), kg^-1/2; gamma, tau_s (t,)"""
+    """points, normals (m, 3), at rest; triangles (t, 3); squared_frequencies (n,), (rad/s)²; shapes (m, 3, n), kg^-1/2; gamma, tau_s (t,)"""
 
     points: Floats
     normals: Floats
-    spacing: Floats
+    triangles: NDArray[np.int32]
     squared_frequencies: Floats
     shapes: Floats
     gamma: Floats
@@ -67,7 +67,7 @@ def full_body(config: Config, folder: Path = Path()) -> FullBody:
     return FullBody(
         points=cloud.points[nodes],
         normals=cloud.normals[nodes],
-        spacing=point_spacing(cloud.points[nodes], node_surface(cloud).triangles),
+        triangles=node_surface(cloud).triangles,
         squared_frequencies=np.asarray(modes.squared_frequencies, float),
         shapes=shapes.reshape(len(nodes), 3, -1),
         gamma=np.array(material.prony.gamma),
@@ -83,7 +83,7 @@ def press(body: FullBody, tip: Tip, positions_m: Floats, period_s: float) -> tup
     near = np.flatnonzero(_distance(body.points, positions_m) < 1.5 * tip.radius_m + 0.02)
     points, inward = body.points[near], -body.normals[near]
     shapes = body.shapes[near].reshape(3 * len(near), -1)
-    radii = np.maximum(smallest_radius_m(body.spacing[near]), tip.radius_m)
+    radii = blunted_radius_m(body.points, body.triangles, tip.radius_m)[near]
     free, driven = _propagator(body, period_s)
     compliance = (shapes * driven[0]) @ shapes.T
     state = np.zeros((2 + len(body.tau_s), len(body.squared_frequencies)))

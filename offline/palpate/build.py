@@ -132,12 +132,7 @@ def build_full_model(
     material = config.material.material()
     keys = stage_keys(config, folder)
     require_memory(expected_size(config, folder))
-    progress("node cloud")
-    cloud, warnings = cache.kept("cloud", keys.cloud, lambda: cloud_and_warnings(config, folder))
-    for text in (*warnings, *plausibility(config, float(np.max(np.ptp(cloud.points, axis=0))))):
-        progress.warn(text)
-    cloud = with_inclusions(config, folder, cloud, progress.warn)
-    fixed = fixed_nodes(config, cloud)
+    cloud, fixed = node_cloud(config, folder, keys, progress, cache)
     patches = contact_patches(config, cloud, fixed)
     progress.note(
         f"{cloud.n_nodes:,} nodes, {int(cloud.boundary.sum()):,} on the surface, {len(fixed)} fixed, "
@@ -178,6 +173,18 @@ def _modes(
         if found.space is not known:
             cache.store("modes", keys.modes, found.space)
     return found.modes, found.change
+
+
+def node_cloud(
+    config: Config, folder: Path, keys: StageKeys, progress: Progress, cache: StageCache
+) -> tuple[NodeCloud, NDArray[np.int64]]:
+    """The nodes with the stiffness of their inclusions, and those that are fixed. Errors as `build_model`."""
+    progress("node cloud")
+    cloud, warnings = cache.kept("cloud", keys.cloud, lambda: cloud_and_warnings(config, folder))
+    for text in (*warnings, *plausibility(config, float(np.max(np.ptp(cloud.points, axis=0))))):
+        progress.warn(text)
+    cloud = with_inclusions(config, folder, cloud, progress.warn)
+    return cloud, fixed_nodes(config, cloud)
 
 
 def _modes_stage(body: AssembledBody) -> str:

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from palpate.build import node_cloud
 from palpate.discretization import conservative
 from palpate.geometry.cloud import NodeCloud
 from palpate.geometry.measures import enclosed_volume
 from palpate.geometry.node_surface import node_surface
-from palpate.inclusions import with_inclusions
 from palpate.memory import machine_memory
 from palpate.model_file import SurfaceModel
 from palpate.model_file.contact_size import ripple_note, small_tool_advice
@@ -22,9 +22,8 @@ from palpate.modes.body_modes import factor_memory, stiffness_memory
 from palpate.modes.held_body import hold
 from palpate.modes.lanczos import LowestModes, lowest_modes
 from palpate.progress import NO_PROGRESS, Progress
-from palpate.scene.plausibility import plausibility
 from palpate.scene.schema import Config, canonical_text, fingerprint
-from palpate.scene_cloud import cloud_and_warnings, fixed_nodes, in_working_area, tool_shapes
+from palpate.scene_cloud import in_working_area, tool_shapes
 from palpate.stage_cache import NO_CACHE, StageCache, key_of
 from palpate.stage_keys import stage_keys
 from palpate.surface_model import evidence
@@ -111,14 +110,8 @@ def surface_body(
 def surface_cloud(
     config: Config, folder: Path, progress: Progress = NO_PROGRESS, cache: StageCache = NO_CACHE
 ) -> tuple[NodeCloud, NDArray[np.int64]]:
-    """The nodes with the stiffness of their inclusions, and those that are fixed. Arguments and errors as `build_surface_model`."""
-    keys = stage_keys(config, folder)
-    progress("node cloud")
-    cloud, warnings = cache.kept("cloud", keys.cloud, lambda: cloud_and_warnings(config, folder))
-    for text in (*warnings, *plausibility(config, float(np.max(np.ptp(cloud.points, axis=0))))):
-        progress.warn(text)
-    cloud = with_inclusions(config, folder, cloud, progress.warn)
-    fixed = fixed_nodes(config, cloud)
+    """As `node_cloud`. Arguments and errors as `build_surface_model`."""
+    cloud, fixed = node_cloud(config, folder, stage_keys(config, folder), progress, cache)
     progress.note(
         f"{cloud.n_nodes:,} nodes, {int(cloud.boundary.sum()):,} on the surface, {len(fixed)} fixed"
     )

@@ -121,6 +121,12 @@ def newtons(message: dict[str, Any]) -> float:
     return float(np.linalg.norm(message["force_n"][0]))
 
 
+def let_go(client: Any, what: str) -> None:
+    """Wait for a free tool, and for `what`: no force."""
+    client.status_when(lambda status: status["tools"]["tip"]["holder"] is None, "a free tool")
+    client.force_when(lambda message: newtons(message) == 0, what)
+
+
 def newtons_shown(page: Any) -> float:
     return float(page.locator("text=/^\\d+\\.\\d\\d/").first.inner_text().split()[0])
 
@@ -150,8 +156,7 @@ def test_a_drag_on_the_organ_presses_and_the_closed_page_lets_go(
             assert pressed["flags"][0] & Flags.IN_CONTACT
             assert pressed["n_contact_points"][0] > 0
             closed_ns = close(page)
-            client.status_when(lambda status: status["tools"]["tip"]["holder"] is None, "a free tool")
-            client.force_when(lambda message: newtons(message) == 0, "no force")
+            let_go(client, "no force")
             first = next(m for m in client.forces if m["server_time_ns"] > closed_ns and newtons(m) == 0)
             took_s.append((first["server_time_ns"] - closed_ns) * 1e-9)
             page = opened(browser, address)
@@ -185,15 +190,10 @@ def test_a_page_that_is_hidden_or_stopped_lets_go(
     served = serve(model=make_surface_model())
     address = view(served.endpoint)
     with connect(served.endpoint) as client:
-
-        def let_go(what: str) -> None:
-            client.status_when(lambda status: status["tools"]["tip"]["holder"] is None, "a free tool")
-            client.force_when(lambda message: newtons(message) == 0, what)
-
         page = opened(browser, address)
         drag_until(page, lambda: newtons(client.forces[-1]) > 0.15, "a force")
         page.context.new_page().bring_to_front()
-        let_go("no force of a page that is hidden")
+        let_go(client, "no force of a page that is hidden")
         page.context.close()
         page = opened(browser, address)
         drag_until(page, lambda: newtons(client.forces[-1]) > 0.15, "a force")
@@ -202,7 +202,7 @@ def test_a_page_that_is_hidden_or_stopped_lets_go(
         try:
             for process in stopped:
                 os.kill(process, signal.SIGSTOP)
-            let_go("no force of a page that is stopped")
+            let_go(client, "no force of a page that is stopped")
         finally:
             for process in stopped:
                 os.kill(process, signal.SIGCONT)
@@ -219,12 +219,10 @@ def test_a_patch_is_dragged_and_let_go_with_the_button_and_by_a_page_that_hangs(
         drag_until(page, lambda: newtons(client.forces[-1]) > 0.1, "a force")
         page.screenshot(path=PICTURES / "patch_pressed.png")
         page.mouse.up()
-        client.status_when(lambda status: status["tools"]["tip"]["holder"] is None, "a free tool")
-        client.force_when(lambda message: newtons(message) == 0, "no force")
+        let_go(client, "no force")
         drag_until(page, lambda: newtons(client.forces[-1]) > 0.1, "a force again")
         page.context.new_cdp_session(page).send("Page.setWebLifecycleState", {"state": "frozen"})
-        client.status_when(lambda status: status["tools"]["tip"]["holder"] is None, "a free tool")
-        client.force_when(lambda message: newtons(message) == 0, "no force of a page that hangs")
+        let_go(client, "no force of a page that hangs")
 
 
 def choose(page: Any, label: str, option: str) -> None:

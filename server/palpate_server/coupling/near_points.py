@@ -21,19 +21,15 @@ class TooManyPoints(ValueError):
         self.count = count
 
 
-def near_points(points: Floats, triangles: NDArray[np.int32], reach_m: Floats, most: int) -> Integers:
-    """(n_points, k), k <= most: for each point those within reach, nearest first, itself included; NONE beyond them.
+def near_points(points: Floats, triangles: NDArray[np.int32], reach_m: float, most: int) -> Integers:
+    """(n_points, k), k <= most: for each point those within reach_m, nearest first, itself included; NONE beyond them.
 
-    reach_m  (n_points,), around each; points that an edge connects with it are always within it
-
-    A point counts only if edges within the reach connect it to the first, so that the far side of a thin lobe does not.
+    Points that an edge connects with it are always near it. Another point counts only if edges within the reach connect it to the first, so that the far side of a thin lobe does not.
     Raises TooManyPoints where there are more than `most`.
     """
     starts, neighbors = _adjacency(len(points), triangles)
     table = np.full((len(points), most), NONE)
-    largest = _fill(
-        np.ascontiguousarray(points, dtype=float), starts, neighbors, np.asarray(reach_m, float), table
-    )
+    largest = _fill(np.ascontiguousarray(points, dtype=float), starts, neighbors, reach_m, table)
     if largest > most:
         raise TooManyPoints(largest)
     return np.ascontiguousarray(table[:, : max(1, int(np.max(np.sum(table != NONE, axis=1), initial=1)))])
@@ -50,7 +46,7 @@ def _adjacency(n_points: int, triangles: NDArray[np.int32]) -> tuple[Integers, I
 
 
 @compiled
-def _fill(points: Floats, starts: Integers, neighbors: Integers, reach: Floats, table: Integers) -> int:
+def _fill(points: Floats, starts: Integers, neighbors: Integers, reach: float, table: Integers) -> int:
     """Walk over the edges from each point, within the reach. Returns the largest number of points found."""
     n = points.shape[0]
     seen, queue, distance = np.full(n, NONE), np.empty(n, np.int64), np.empty(n)
@@ -67,7 +63,7 @@ def _fill(points: Floats, starts: Integers, neighbors: Integers, reach: Floats, 
                     continue
                 seen[other] = start
                 apart = np.sqrt(np.sum((points[other] - points[start]) ** 2))
-                if apart <= reach[start] or here == start:
+                if apart <= reach or here == start:
                     queue[count], distance[count] = other, apart
                     count += 1
         largest = max(largest, count)

@@ -113,18 +113,16 @@ class SphereContact(NamedTuple):
             raise ValueError(f"state has shape {state.shape}: expected ({self.state_size()},)")
         if not np.all(np.isfinite(state)):
             raise ValueError("state: expected finite numbers")
-        place, n_points = 0, len(self.tracking.points)
-        for values in self.arrays():
+        arrays = self.arrays()
+        parts = np.split(state, np.cumsum([values.size for values in arrays])[:-1])
+        for values, part in zip(arrays, parts, strict=True):
             if values.dtype == np.int64:  # compiled code takes them as indices
                 is_point = values is self.body.watched or values is self.tracking.anchor
-                given, last = state[place : place + values.size], n_points if is_point else 2**53
-                if np.any((given != np.floor(given)) | (given < NOBODY) | (given >= last)):
+                last = len(self.tracking.points) if is_point else 2**53
+                if np.any((part != np.floor(part)) | (part < NOBODY) | (part >= last)):
                     raise ValueError("state: expected one that `save` wrote with the same model")
-            place += values.size
-        place = 0
-        for values in self.arrays():
-            values[...] = state[place : place + values.size].reshape(values.shape)
-            place += values.size
+        for values, part in zip(arrays, parts, strict=True):
+            values[...] = part.reshape(values.shape)
 
     def shown_size(self) -> int:
         return self.body.q.size + self.body.force.size
@@ -147,11 +145,12 @@ def make(
         raise ValueError("points: expected at least one")
     n = len(model.tools)
     spacing = point_spacing(model.points, model.triangles)
-    carried = smallest_radius_m(spacing)
     largest = max((tool.radius_m for tool in model.tools), default=0.0)
     # Half around the sphere, and a few points more; where points are sparse those that an edge connects.
-    near = _near(model, largest, np.full(len(spacing), 1.25 * largest + float(np.median(spacing))))
-    contact = _assemble(model, near, carried, n, n * (near.shape[1] + _SPARE_SLOTS), sweeps)
+    near = _near(model, largest, 1.25 * largest + float(np.median(spacing)))
+    contact = _assemble(
+        model, near, smallest_radius_m(spacing), n, n * (near.shape[1] + _SPARE_SLOTS), sweeps
+    )
     stiffness = np.broadcast_to(np.asarray(stiffness_n_per_m, float), (n,))
     for i, tool in enumerate(model.tools):
         set_tool(contact, i, tool.radius_m, tool.friction, float(stiffness[i]))
@@ -172,10 +171,10 @@ def empty(n_tools: int) -> SphereContact:
     return _assemble(model, np.zeros((0, 1), np.int64), np.zeros(0), n_tools, 0, 0)
 
 
-def _near(model: SurfaceModel, radius: float, reach: Floats) -> Integers:
+def _near(model: SurfaceModel, radius: float, reach_m: float) -> Integers:
     """As `near_points`, for a sphere. Raises ValueError where it is too large."""
     try:
-        return near_points(model.points, model.triangles, reach, _MOST_NEAR)
+        return near_points(model.points, model.triangles, reach_m, _MOST_NEAR)
     except TooManyPoints as error:
         fit = radius * math.sqrt(_MOST_NEAR / error.count)
         raise ValueError(

@@ -161,13 +161,14 @@ def tick_run(path: Path, seconds: float) -> list[Finding]:
     timer, compute = status["timer_lateness_s"], status["compute_time_s"]
     late = status["late_ticks"] / max(status["ticks"], 1)
     skipped = status["skipped_ticks"] / max(status["ticks"], 1)
+    for_late_ticks = _for_late_ticks()
     return [
         _duration(
             "timer lateness",
             timer["p50"],
             timer["p99"],
             TIMER_LATENESS_P99_S,
-            _for_late_ticks(),
+            for_late_ticks,
         ),
         _duration(
             "tick computation",
@@ -178,7 +179,7 @@ def tick_run(path: Path, seconds: float) -> list[Finding]:
         ),
         _round_trip("command to force", trips, "see timer and round trip"),
         _unanswered("unanswered commands", trips, "see timer and round trip"),
-        _share("late ticks", late, LATE_SHARE, _for_late_ticks()),
+        _share("late ticks", late, LATE_SHARE, for_late_ticks),
         _share("skipped ticks", skipped, SKIPPED_SHARE, "stop other programs"),
     ]
 

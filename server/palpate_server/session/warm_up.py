@@ -54,7 +54,7 @@ def _call_each(period_s: float, n_tools: int) -> None:
     scheduler.withdraw_change(image)
     scheduler.read_snapshot(image, np.zeros(0), np.zeros((n_tools, 3)))
     settle.press(running.empty(), np.zeros((0, 3)), Touch(np.zeros(0, np.int64), np.zeros(0, REACTION)), [])
-    near_points(np.zeros((1, 3)), np.zeros((0, 3), np.int32), np.ones(1), 1)
+    near_points(np.zeros((1, 3)), np.zeros((0, 3), np.int32), 1.0, 1)
     scheduler.stop(memory.shared)
     wake = os.eventfd(0)
     scheduler.run_at_deadlines(image, wake)
