@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 from collections import Counter
@@ -10,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 import zenoh
 
@@ -93,25 +95,19 @@ def test_status_and_queries_run_before_ordinary_programs_and_what_the_server_sta
     wait_for(lambda: _priorities(pid)[threads.SERVICE_PRIORITY] == 3, "three threads of low priority")
     with Connection(endpoint, name=RECORDER) as connection:
         connection.control("record", file="a.mcap")
-        (writer,) = _children(pid)
-        assert os.sched_getscheduler(int(writer)) == os.SCHED_OTHER
+        (writer,) = psutil.Process(pid).children()
+        assert os.sched_getscheduler(writer.pid) == os.SCHED_OTHER
         connection.control("record", file=None)
     assert server.stop() == 0
 
 
 def _priorities(pid: int) -> Counter[int]:
     """How many threads of a process have a priority."""
-    tasks = Path(f"/proc/{pid}/task").iterdir()
-    return Counter(os.sched_getparam(int(task.name)).sched_priority for task in tasks)
-
-
-def _children(pid: int) -> list[str]:
-    """Of all threads of a process."""
-    return [
-        child
-        for task in Path(f"/proc/{pid}/task").iterdir()
-        for child in (task / "children").read_text().split()
-    ]
+    found: Counter[int] = Counter()
+    for thread in psutil.Process(pid).threads():
+        with contextlib.suppress(ProcessLookupError):  # it has ended since
+            found[os.sched_getparam(thread.id).sched_priority] += 1
+    return found
 
 
 def test_no_client_loses_the_server_beside_busy_loops(start: Callable[..., Any], tmp_path: Path) -> None:

@@ -5,10 +5,9 @@ It needs Chromium, such as Debian's packages `chromium` and `fonts-dejavu-core`.
 
 from __future__ import annotations
 
+import contextlib
 import math
-import os
 import shutil
-import signal
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from palpate.model_file import SurfaceModel, save_model
@@ -164,19 +164,13 @@ def test_a_drag_on_the_organ_presses_and_the_closed_page_lets_go(
     assert statistics.median(took_s) < CLOSED_S, took_s
 
 
-def renderers(of: int) -> list[int]:
-    """The processes of Chromium that run its pages, of those that a process has started."""
-    found, parents = [], {of}
-    for status in sorted(Path("/proc").glob("[0-9]*/status"), key=lambda path: int(path.parts[2])):
-        try:
-            fields = dict(line.split(":\t", 1) for line in status.read_text().splitlines() if ":\t" in line)
-            command = (status.parent / "cmdline").read_bytes()
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-        if int(fields["PPid"]) in parents:
-            parents.add(int(fields["Pid"]))
-            if b"--type=renderer" in command:
-                found.append(int(fields["Pid"]))
+def renderers() -> list[psutil.Process]:
+    """Of the processes that this one has started, those of Chromium that run its pages."""
+    found = []
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if "--type=renderer" in " ".join(process.cmdline()):
+                found.append(process)
     return found
 
 
@@ -197,15 +191,15 @@ def test_a_page_that_is_hidden_or_stopped_lets_go(
         page.context.close()
         page = opened(browser, address)
         drag_until(page, lambda: newtons(client.forces[-1]) > 0.15, "a force")
-        stopped = renderers(os.getpid())
+        stopped = renderers()
         assert stopped
         try:
             for process in stopped:
-                os.kill(process, signal.SIGSTOP)
+                process.suspend()
             let_go(client, "no force of a page that is stopped")
         finally:
             for process in stopped:
-                os.kill(process, signal.SIGCONT)
+                process.resume()
         page.context.close()
 
 
