@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections import Counter
 from typing import Any
 
 from palpate_client.messages import Description, Force
@@ -14,6 +15,9 @@ REMEMBERED = 10_000  # commands; an answer to an older one breaks the contract
 # A busy machine or network may delay commands until the force has faded. The flags say so, and the contract allows it. Zenoh
 # closes a link that is silent for this long. So if forces stay faded for longer although we send, something else is wrong.
 LONGEST_OUTAGE_NS = LEASE_MS * 1_000_000
+# Plain numbers: an operation on `Flags` takes a microsecond, and a force comes each millisecond.
+_STALE = int(Flags.STALE)
+_FADING = int(Flags.DECAYING | Flags.STALE)
 MAX_BREAKS_LISTED = 20  # one cause can break the contract in every tick
 
 
@@ -41,7 +45,7 @@ class Contract:
         self._first_of_hold = 0  # the first command since the tool was acquired
         self._hold_is_answered = False  # whether one of those has been answered
         self._round_trips_ns = array("q")  # an hour at 1 kHz is 29 MB
-        self._flag_counts = dict.fromkeys(Flags, 0)
+        self._flag_words: Counter[int] = Counter()  # how often each combination of flags came
         self._breaks = 0
         self._last: Force | None = None
         self._newest_sent_ns = 0
@@ -74,9 +78,7 @@ class Contract:
         """Check a force. True if it keeps the contract: it may be rendered only then, and only while `holding`."""
         breaks = self._breaks
         self.forces_received += 1
-        for flag in Flags:
-            if force.flags & flag:
-                self._flag_counts[flag] += 1
+        self._flag_words[force.flags] += 1
         if self._check_value(force) and self._check_order(force):
             self._check_answer(force)
         return self._breaks == breaks
@@ -92,6 +94,8 @@ class Contract:
 
     def summary(self) -> dict[str, Any]:
         """All counts, percentiles of the round trip (s), flags (ticks) and breaks, as `palpate client --json` prints them."""
+        words = dict(self._flag_words)  # forces may go on coming, on another thread
+        flags = {flag.name: sum(n for word, n in words.items() if word & flag) for flag in Flags}
         shares = {"p50": 0.5, "p99": 0.99, "p99_9": 0.999, "max": 1.0}
         return {
             "commands_sent": self.commands_sent,
@@ -101,7 +105,7 @@ class Contract:
             "forces_lost": self.forces_lost,
             "round_trip_s": {name: self.round_trip_s(share) for name, share in shares.items()},
             "largest_force_n": self.largest_force_n,
-            "flags": {flag.name: count for flag, count in self._flag_counts.items() if count},
+            "flags": {name: count for name, count in flags.items() if count},
             "contract_broken": self.broken,
         }
 
@@ -114,9 +118,9 @@ class Contract:
         self.largest_force_n = max(self.largest_force_n, magnitude)
         if magnitude > self._max_force_n + ROUNDING_N:
             self._break(force, f"the force is {magnitude} N, the limit {self._max_force_n} N")
-        if force.flags & Flags.STALE and magnitude > 0:
+        if force.flags & _STALE and magnitude > 0:
             self._break(force, f"the input is stale and the force still {magnitude} N")
-        if not force.flags & (Flags.DECAYING | Flags.STALE) and force.input_age_ns > self._hold_ns:
+        if not force.flags & _FADING and force.input_age_ns > self._hold_ns:
             self._break(force, f"the input is {force.input_age_ns / 1e6} ms old and no flag says so")
         if self.holding and force.sequence < 0 and self._hold_is_answered:
             # The server keeps a holder's last command, however silent the holder is.
@@ -173,7 +177,7 @@ class Contract:
         """
         end_ns = min(sent_ns + force.input_age_ns, self._newest_sent_ns)
         outage_ns = end_ns - max(sent_ns, self._sending_since_ns)
-        in_outage = bool(force.flags & Flags.STALE) and outage_ns > LONGEST_OUTAGE_NS
+        in_outage = bool(force.flags & _STALE) and outage_ns > LONGEST_OUTAGE_NS
         if in_outage and not self._in_outage:
             self._break(
                 force,

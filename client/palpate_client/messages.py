@@ -148,7 +148,9 @@ def check_force(message: Mapping[str, Any], n_tools: int) -> None:
         elif width == 1:
             good = _is_list(value, n_tools, kind)
         else:
-            good = _is_list(value, n_tools, list) and all(_is_list(row, width, kind) for row in value)
+            good = _is_list(value, n_tools, list)
+            for row in value if good else ():
+                good = good and _is_list(row, width, kind)
         if not good:
             raise wire.MalformedMessage(
                 "wrong_type", f"{name} is {value!r:.100}: expected it as in docs/wire.md"
@@ -156,7 +158,7 @@ def check_force(message: Mapping[str, Any], n_tools: int) -> None:
 
 
 def _is_list(value: Any, length: int, kind: type) -> bool:
-    return type(value) is list and len(value) == length and all(type(item) is kind for item in value)
+    return type(value) is list and [*map(type, value)] == [kind] * length
 
 
 _STATUS_TYPES: Mapping[str, type] = {

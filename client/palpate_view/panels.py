@@ -113,6 +113,7 @@ class Panels:
             self.stiffness = gui.add_slider(
                 "Stiffness", 0.1, 10.0, 0.1, 1.0, visible=False, hint="All moduli, times the file's"
             )
+            self.model.on_update(self._model_chosen)
             self.load = gui.add_button("Load")
             self.record = gui.add_button(RECORD, icon=viser.Icon.PLAYER_RECORD)
             self.session = gui.add_html("")
@@ -134,6 +135,11 @@ class Panels:
         _set(self.model, running if running in files else self.model.options[0])
         self.stiffness.visible = stiffness_factor is not None
         _set(self.stiffness, 1.0 if stiffness_factor is None else stiffness_factor)
+
+    def _model_chosen(self, event: Any) -> None:
+        """Another file is loaded with its own stiffness, unless the user says otherwise then."""
+        if event.client is not None:
+            _set(self.stiffness, 1.0)
 
     def fill(self, radii_m: dict[str, float], friction: float | None, *, has_error: bool) -> None:
         """Show what the tools of a model, by name, can be asked for. `friction` is the model's, None for patches."""

@@ -30,13 +30,22 @@ from palpate_view.session import Session
 DEFAULT_PORT = 8080
 RETRY_S = 1.0
 _TOLD_S = 6.0
-# The page ends a drag when its window loses the focus. A page that is hidden or closed does so, too: at once, where the end of its
-# connection is seen some 0.1 s later, because the browser ends the thread that has it first.
-_LET_GO = """
+# What the page itself has to do. It ends a drag when its window loses the focus. When it is hidden or closed, it does so, too: at
+# once, where the end of its connection is seen some 0.1 s later, because the browser ends the thread that has it first. On a phone
+# it folds the sheet of controls, which would cover the organ; viser has no message for that.
+_SCRIPT = """
 if (!window.palpateLetsGo) {
   window.palpateLetsGo = () => window.dispatchEvent(new Event("blur"));
   window.addEventListener("pagehide", window.palpateLetsGo);
   document.addEventListener("visibilitychange", () => { if (document.hidden) window.palpateLetsGo(); });
+  if (window.matchMedia("(max-width: 36em)").matches) {
+    const folding = setInterval(() => {
+      const papers = [...document.querySelectorAll(".mantine-Paper-root")];
+      const sheet = papers.find(e => e.style.position === "fixed" && e.style.bottom === "0px");
+      const handle = sheet?.querySelector('[style*="cursor: pointer"]');
+      if (handle) { clearInterval(folding); handle.click(); }
+    }, 100);
+  }
 }
 """
 
@@ -84,9 +93,7 @@ class View:
 
     async def _opened(self, client: viser.ClientHandle) -> None:
         # viser has no public way to this message of its own.
-        client._websock_connection.queue_message(RunJavascriptMessage(_LET_GO))
-        if client.camera.aspect < 1.0:  # on a phone the controls would cover the organ
-            client.gui.main_panel.minimize()
+        client._websock_connection.queue_message(RunJavascriptMessage(_SCRIPT))
         if session := self.session:
             session.frame_organ(client)
 

@@ -23,10 +23,13 @@ _LONGEST_ARROW = 0.9  # of the organ's size
 _SMALLEST_FORCE_N = 0.01
 _STILL_M = 2e-5  # displacements that change by less look the same
 _GHOST_GAP_M = 2e-4  # a ghost that is nearer to the tool is not shown
-_ROUND = 10  # subdivisions of a sphere
+_ROUND = 5  # subdivisions of a sphere
 _SHAFT = 0.4  # of the organ's size
 _LIFT = 4e-4  # of the organ's size: so far the colors are above the tissue
 _UP = np.array([0.0, 0.0, 1.0])
+_DECIMALS = (
+    4  # of positions in the scene, 10 um: what moves by less is not sent, and the page need not draw it
+)
 
 Drag = Callable[[Any], Any]  # an async function that takes viser's SceneNodeDragEvent
 
@@ -66,6 +69,7 @@ class Scene:
         self._label = api.add_label("/force_label", "", anchor="bottom-center", font_screen_scale=1.3)
         for node in (self._ghost, self._contact, self._force, self._label):
             node.visible = False
+        self.shown_m = vertices  # (n, 3), m: where the vertices are seen
         self._drawn = np.full_like(vertices, np.nan, np.float32)  # the displacement that is seen
         self._drawn_scale: tuple[bool, float] | None = None
 
@@ -86,13 +90,13 @@ class Scene:
         if scale == self._drawn_scale and np.abs(displacement - self._drawn).max() < _STILL_M:
             return
         self._drawn, self._drawn_scale = displacement.copy(), scale
-        moved = self.vertices + displacement
-        self._organ.vertices = (SCENE_PER_M * moved).astype(np.float32)
+        self.shown_m = self.vertices + displacement
+        self._organ.vertices = (SCENE_PER_M * self.shown_m).astype(np.float32)
         if values is None:
             for node in self._bands:
                 node.visible = False
             return
-        found = bands(moved + self._lift, self.triangles, values, colors.band_levels(largest))
+        found = bands(self.shown_m + self._lift, self.triangles, values, colors.band_levels(largest))
         for node, (points, faces) in zip(self._bands, found, strict=True):
             if len(faces):
                 node.vertices, node.faces = SCENE_PER_M * points, faces
@@ -101,26 +105,32 @@ class Scene:
     def draw_tool(self, center_m: Floats, ghost_m: Floats, radius_m: float, axis: Floats) -> None:
         """The tool, its shaft along `axis` (3,), and its ghost where the device is, if that is elsewhere."""
         self._tool.radius = self._ghost.radius = SCENE_PER_M * radius_m
-        self._tool.position = SCENE_PER_M * center_m
+        self._tool.position = in_scene(center_m)
         length_m = _SHAFT * self.size_m
         self._shaft.radius, self._shaft.height = SCENE_PER_M * 0.28 * radius_m, SCENE_PER_M * length_m
-        self._shaft.position = SCENE_PER_M * (center_m + 0.5 * length_m * axis)
-        self._shaft.wxyz = rotation_to(axis)
+        self._shaft.position = in_scene(center_m + 0.5 * length_m * axis)
+        self._shaft.wxyz = rotation_to(axis.round(_DECIMALS))
         self._ghost.visible = float(np.linalg.norm(ghost_m - center_m)) > _GHOST_GAP_M
-        self._ghost.position = SCENE_PER_M * ghost_m
+        self._ghost.position = in_scene(ghost_m)
 
     def draw_contact(self, points_m: Floats, center_m: Floats, force_n: Floats) -> None:
         """The points in contact (k, 3), m, and the force on the tool as an arrow from its center, with its magnitude."""
         self._contact.visible = bool(len(points_m))
         if len(points_m):
-            self._contact.points = (SCENE_PER_M * points_m).astype(np.float32)
+            self._contact.points = in_scene(points_m).astype(np.float32)
+        force_n = force_n.round(2)  # as the label shows it
         newtons = float(np.linalg.norm(force_n))
         self._force.visible = self._label.visible = newtons > _SMALLEST_FORCE_N
         if newtons > _SMALLEST_FORCE_N:
             end = center_m + arrow(force_n, self.size_m)
-            self._force.points = (SCENE_PER_M * np.array([[center_m, end]])).astype(np.float32)
-            self._label.position = SCENE_PER_M * end
+            self._force.points = in_scene(np.array([[center_m, end]])).astype(np.float32)
+            self._label.position = in_scene(end)
             self._label.text = f"{newtons:.2f} N"
+
+
+def in_scene(points_m: Floats) -> Floats:
+    """Points of the model, m, where the scene has them."""
+    return (SCENE_PER_M * points_m).round(_DECIMALS)
 
 
 def arrow(force_n: Floats, size_m: float) -> Floats:

@@ -32,6 +32,7 @@ _PULSE_TIMEOUT_S = LONGEST_SILENCE_S
 _SMALLEST_SCALE_M = 1e-3
 _SCALE_HALF_LIFE_S = 4.0  # of the colors' largest value, after the tissue has moved less
 _IDENTITY = ("config_sha256", "stiffness_factor")
+_TURNED = 0.02  # rad: a shaft that is so near to its axis is there
 _PATCH_SPHERE = 0.4  # of the patch's radius: of the sphere that is drawn for its tool
 
 
@@ -78,6 +79,7 @@ class Session:
             description.message["model_file"],
             self._model["stiffness_factor"] if self._anywhere else None,
         )
+        self._loading = threading.Lock()  # held while the connection has to stay
         self._hand = Hand(connection, tell)  # its thread is ended by `run`
         self._scene.on_drag(self._on_organ, self._on_tool)
         for client in page.get_clients().values():
@@ -104,6 +106,8 @@ class Session:
         finally:
             self._hand.end()
             self._watch.end()
+            with self._loading:
+                pass
 
     # Pages
 
@@ -136,10 +140,10 @@ class Session:
         if self._anywhere:
             center, points = state.tip_m, np.zeros((0, 3))
             if force.flags & Flags.IN_CONTACT:
-                points = touched_points(self._scene.vertices + surface, state.tip_m, radius_m)
+                points = touched_points(self._scene.shown_m, state.tip_m, radius_m)
         else:
             center = state.tip_m + radius_m * self._axis
-            points = self._patch_points(surface) if force.flags & Flags.IN_CONTACT else np.zeros((0, 3))
+            points = np.zeros((0, 3)) if tool["holder"] is None else self._patch_points()
         ghost = self._hand.position_m
         if ghost is None:
             ghost = state.device_m
@@ -193,12 +197,9 @@ class Session:
             return _LIMITED[next(flag for flag in _LIMITED if flags & flag)], False
         if flags & (Flags.DECAYING | Flags.STALE):
             return "no commands: the force has faded", False
-        doing = (
-            "holds the tissue" if flags & Flags.ATTACHED else "slides" if flags & Flags.SLIDING else "touches"
-        )
-        doing = doing if flags & Flags.IN_CONTACT else "does not touch"
+        doing = touch_words(flags) if self._anywhere else "moves its patch"
         mine = holder == self._connection.name
-        return f"{doing}" if mine else f"{html.escape(holder)} holds the tool: it {doing}", True
+        return doing if mine else f"{html.escape(holder)} holds the tool: it {doing}", True
 
     def _facts(self, status: dict[str, Any]) -> list[tuple[str, str]]:
         def times(name: str) -> str:
@@ -216,16 +217,20 @@ class Session:
             ("faults, skipped ticks", f"{status['faults']}, {status['skipped_ticks']}"),
         ]
 
-    def _patch_points(self, surface: NDArray[np.float32]) -> Floats:
+    def _patch_points(self) -> Floats:
         """(k, 3), m: the points of a patch model's tool where they are now."""
         tool = self._tools[self._watch.tool]
         near = np.linalg.norm(self._scene.vertices - np.asarray(tool.start_m), axis=1) <= tool.radius_m
-        return self._scene.vertices[near] + surface[near]
+        return self._scene.shown_m[near]
 
     def _turn_axis(self) -> None:
         """Turn the shaft a little towards the normal of the tissue that is touched; back when nothing is held."""
-        wanted = self._hand.normal
-        axis = self._axis + 0.15 * ((self._normal() if wanted is None else wanted) - self._axis)
+        wanted = self._normal() if self._hand.normal is None else self._hand.normal
+        away = wanted - self._axis
+        if float(np.linalg.norm(away)) < _TURNED:
+            self._axis = wanted
+            return
+        axis = self._axis + 0.15 * away
         self._axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
 
     def _normal(self) -> Floats:
@@ -334,7 +339,7 @@ class Session:
     def load(self, file: str, stiffness_factor: float) -> None:
         """Have the server run a model of its folder, that many times as stiff; `run` sees it."""
         try:
-            with Tool(self._connection, self._watch.tool):
+            with self._loading, Tool(self._connection, self._watch.tool):
                 answer = self._connection.control("load", file=file, stiffness_factor=stiffness_factor)
             factor = answer["model"]["stiffness_factor"]
             self._tell(
@@ -364,6 +369,15 @@ _LIMITED = {
     Flags.JUMPED: "on its way",
     Flags.SPEED_LIMITED: "at the largest speed",
 }
+
+
+def touch_words(flags: int) -> str:
+    """How a tool of a surface model touches."""
+    if not flags & Flags.IN_CONTACT:
+        return "does not touch"
+    if flags & Flags.ATTACHED:
+        return "holds the tissue"
+    return "slides" if flags & Flags.SLIDING else "touches"
 
 
 def surface_at_rest(geometry: Geometry) -> tuple[Floats, Triangles]:
