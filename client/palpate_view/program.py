@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import io
 import ipaddress
+import os
 import signal
 import socket
 import sys
@@ -29,6 +30,7 @@ from palpate_view.session import Session
 
 DEFAULT_PORT = 8080
 RETRY_S = 1.0
+NICENESS = 10  # drawing waits for the loop, and for a device's bridge
 _TOLD_S = 6.0
 # What the page itself has to do. It ends a drag when its window loses the focus. When it is hidden or closed, it does so, too: at
 # once, where the end of its connection is seen some 0.1 s later, because the browser ends the thread that has it first. On a phone
@@ -116,6 +118,7 @@ class View:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     options = parse_options(arguments)
+    os.nice(NICENESS)  # before any thread begins
     zenoh.init_log_from_env_or("off")
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
