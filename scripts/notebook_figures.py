@@ -2,7 +2,7 @@
 
     python scripts/notebook_figures.py
 
-Run it where configs/ is, and the my-organ.toml and my-organ.npz of docs/tour.md.
+Run it where configs/ is, and the my-organ.toml, my-organ.npz and touchable.npz of docs/tour.md.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PICTURES = {
 }
 """The picture of each function's call on the page."""
 
-TOUR_PICTURES = ("press.png",)
+TOUR_PICTURES = ("press.png", "touch.png")
 
 
 def main() -> None:

@@ -74,5 +74,6 @@ def test_all_commands_but_the_installation(tmp_path: Path) -> None:
     told = run(tmp_path, *others)
     assert "3.0 mm deep" in told
     assert "verdict: fair" in told
-    for made in ("poke.csv", "my-organ.npz", "press.png"):
+    assert "verdict: good in the working areas" in told
+    for made in ("poke.csv", "my-organ.npz", "press.png", "touchable.npz", "touch.png"):
         assert (tmp_path / made).stat().st_size > 1000
