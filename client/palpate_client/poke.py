@@ -58,6 +58,8 @@ def run(connection: Connection, options: argparse.Namespace, trajectory: Traject
     lost: str | None = None
     held = contextlib.ExitStack()
     held.enter_context(tool)  # an error here is a start that failed, an error below a loss
+    for warning in tool.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
     connection.next_status(STATUS_WAIT_S)
     before = connection.status
     try:

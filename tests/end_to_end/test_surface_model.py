@@ -200,6 +200,18 @@ def test_the_headless_client_and_the_bridge_run_unchanged(
     assert (code, err) == (0, ""), err  # no warning either
 
 
+def test_the_headless_client_shows_the_servers_warnings(
+    serve: Callable[..., Any], run_example: Callable[..., Any], make_surface_model: Callable[..., SurfaceModel]
+) -> None:
+    model = make_surface_model()
+    small = replace(model, tools=(replace(model.tools[0], radius_m=0.002),))
+    served = serve(model=small)
+    code, _, err = run_example("palpate_client.poke", served.endpoint, "--duration-s", "1").finish()
+    assert code == 0, err
+    (warning,) = err.splitlines()
+    assert warning.startswith("warning: tool 'tip': radius_m = 0.002 touches about")
+
+
 def test_three_tools_of_two_clients_are_repeated_bit_for_bit_and_are_in_the_black_box(
     serve: Callable[..., Any],
     connect: Callable[..., Any],
