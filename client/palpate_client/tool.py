@@ -80,9 +80,13 @@ class Tool:
                 f"the connection uses the tool {self._connection.tool_in_use!r}: leave its `with` statement first, "
                 "or use a connection for each tool"
             )
-        self._acquire()
-        self._forces = self._connection.on_tool_force(self.name, self._on_force)
         self._connection.tool_in_use = self.name
+        try:
+            self._acquire()
+            self._forces = self._connection.on_tool_force(self.name, self._on_force)
+        except BaseException:
+            self._connection.tool_in_use = None
+            raise
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:

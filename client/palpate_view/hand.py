@@ -37,16 +37,18 @@ class _LetGo(Exception):
 class Hand:
     """Holds a tool of a connection from `take` to `let_go`. Call `take`, `aim`, `sign` and `let_go` from any thread.
 
-    tell(text) is called with what the user has to know, such as that another client holds the tool.
+    tell(text, page) is called with what the user of a page has to know, such as that another client holds the tool. A warning of the
+    server is told once.
     """
 
-    def __init__(self, connection: Connection, tell: Callable[[str], None]) -> None:
+    def __init__(self, connection: Connection, tell: Callable[[str, int], None]) -> None:
         self._connection = connection
         self._tell = tell
         self._lock = threading.Condition()
         self._grip: Grip | None = None
         self._gesture: Gesture | None = None
         self._sign_s = 0.0
+        self._warned: set[str] = set()
         self._ended = False
         # Of the newest command, in the model's frame; None while no tool is held.
         self.position_m: Floats | None = None
@@ -59,9 +61,9 @@ class Hand:
         return self._grip
 
     def take(self, grip: Grip, gesture: Gesture) -> bool:
-        """Hold a tool. False if another page has it."""
+        """Hold a tool. False if another page has it, or after `end`."""
         with self._lock:
-            if self._grip is not None and self._grip.page != grip.page:
+            if self._ended or (self._grip is not None and self._grip.page != grip.page):
                 return False
             self._grip, self._gesture, self._sign_s = grip, gesture, time.monotonic()
             self._lock.notify()
@@ -106,7 +108,7 @@ class Hand:
             except _LetGo:
                 pass
             except (ClientError, ValueError, RuntimeError) as error:
-                self._tell(str(error))
+                self._tell(str(error), grip.page)
             self.position_m = self.normal = None
             with self._lock:
                 if self._grip is grip:
@@ -116,7 +118,9 @@ class Hand:
         """Move the tool until it is let go. Raises _LetGo then, and what `Tool` raises."""
         with Tool(self._connection, grip.tool, radius_m=grip.radius_m, friction=grip.friction) as tool:
             for warning in tool.warnings:
-                self._tell(warning)
+                if warning not in self._warned:
+                    self._warned.add(warning)
+                    self._tell(warning, grip.page)
             home = np.asarray(tool.home_m)
             self.aim(grip.page, lambda gesture: at_home(gesture, home))
             begun = self._gesture
@@ -129,7 +133,8 @@ class Hand:
             if away_m > farthest_m:
                 self._tell(
                     f"This is {1e3 * away_m:.0f} mm from where the tool starts: the server's workspace ends at "
-                    f"{1e3 * farthest_m:.0f} mm (`palpate serve --workspace-m`)."
+                    f"{1e3 * farthest_m:.0f} mm (`palpate serve --workspace-m`).",
+                    grip.page,
                 )
                 raise _LetGo
             self._move(grip, tool, Motion(begun.start_m, np.zeros(3)))
@@ -142,7 +147,7 @@ class Hand:
         while self._grip is grip and (gesture := self._gesture) is not None:
             now_s = time.monotonic()
             if now_s - self._sign_s > LONGEST_SILENCE_S:
-                self._tell("The page was silent, so the tool was let go.")
+                self._tell("The page was silent, so the tool was let go.", grip.page)
                 return
             # A tool that is far away jumps here, and touches nothing until its force has faded in.
             arrived = arrived or (tool.newest is not None and tool.newest.force_scale >= 1.0)

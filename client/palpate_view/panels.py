@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,6 +64,7 @@ class Chart:
 
     def __init__(self, gui: viser.GuiApi, title: str, lines: Sequence[Line], height: int) -> None:
         self._lines = lines
+        gui.add_html(chart_title_html(title, lines))
         nothing = (np.array([-SHOWN_S, 0.0]), *(np.zeros(2) for _ in lines))
         axis = uplot.Axis(
             stroke=_AXIS, grid=uplot.Axis_Grid(stroke=_GRID, width=1), ticks=uplot.Axis_Ticks(show=False)
@@ -80,7 +81,6 @@ class Chart:
             height=height,
             padding=(10, 14, 0, 0),
         )
-        gui.add_html(chart_legend_html(title, lines))
 
     def draw(self, columns: dict[str, NDArray[np.float64]]) -> None:
         if len(columns["time_s"]) > 1:
@@ -141,18 +141,25 @@ class Panels:
         if event.client is not None:
             _set(self.stiffness, 1.0)
 
-    def fill(self, radii_m: dict[str, float], friction: float | None, *, has_error: bool) -> None:
-        """Show what the tools of a model, by name, can be asked for. `friction` is the model's, None for patches."""
+    def fill(self, tools: Sequence[Mapping[str, Any]], *, anywhere: bool, has_error: bool) -> None:
+        """Show what a model's tools can be asked for: `name`, `radius_m` and `friction` of each, as the server describes it."""
         self.color.options = (DISPLACEMENT, ERROR, NO_COLOR) if has_error else (DISPLACEMENT, NO_COLOR)
-        self.tool.options = tuple(radii_m)
-        _set(self.tool, next(iter(radii_m)))
-        self.tool.visible = len(radii_m) > 1
-        self.radius.visible = self.friction.visible = friction is not None
-        if friction is not None:
-            largest_mm = 1e3 * max(radii_m.values())
+        self.tool.options = tuple(tool["name"] for tool in tools)
+        _set(self.tool, tools[0]["name"])
+        self.tool.visible = len(tools) > 1
+        self.radius.visible = self.friction.visible = anywhere
+        if anywhere:
+            largest_mm = 1e3 * max(tool["radius_m"] for tool in tools)
             self.radius.min, self.radius.step, self.radius.max = largest_mm / 5, largest_mm / 50, largest_mm
-            _set(self.radius, 1e3 * next(iter(radii_m.values())))
-            _set(self.friction, friction)
+            self.show_tip(tools[0])
+
+    def show_tip(self, tool: Mapping[str, Any]) -> None:
+        """Set radius and friction to those of a tool in the model file."""
+        _set(self.radius, 1e3 * tool["radius_m"])
+        _set(self.friction, tool["friction"])
+
+    def show_no_server(self) -> None:
+        self.readout.content = readout_html(0.0, 0.0, "No server: waiting for the next one", False)
 
     def radius_m(self) -> float:
         return 1e-3 * float(self.radius.value)
@@ -185,7 +192,7 @@ def readout_html(force_n: float, depth_m: float, words: str, good: bool) -> str:
     )
 
 
-def chart_legend_html(title: str, lines: Sequence[Line]) -> str:
+def chart_title_html(title: str, lines: Sequence[Line]) -> str:
     """A chart's title, and each line's color and name."""
     names = "".join(
         f'<span style="white-space:nowrap"><span style="color:{line.color}">&#9644;</span> {line.label}</span>'
@@ -193,7 +200,7 @@ def chart_legend_html(title: str, lines: Sequence[Line]) -> str:
         if line.label
     )
     return (
-        '<div style="display:flex;flex-wrap:wrap;gap:0.1em 0.8em;padding:0 1em 0.5em 1em;font-size:0.8em;line-height:1.4">'
+        '<div style="display:flex;flex-wrap:wrap;gap:0.1em 0.8em;padding:0.5em 1em 0 1em;font-size:0.8em;line-height:1.4">'
         f'<span style="font-weight:600">{title}</span>{names}</div>'
     )
 

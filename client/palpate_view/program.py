@@ -17,37 +17,39 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import viser
 import zenoh
 from viser._messages import RunJavascriptMessage
 
-from palpate_client import ClientError, Connection, Incompatible, ServerGone
+from palpate_client import ClientError, Connection, ServerGone
 from palpate_client.arguments import add_connection_options, connection_for
 from palpate_view.panels import Panels
 from palpate_view.session import Session
 
 DEFAULT_PORT = 8080
 RETRY_S = 1.0
-NICENESS = 10  # drawing waits for the loop, and for a device's bridge
+NICENESS = 10  # of the thread that draws
 _TOLD_S = 6.0
-# What the page itself has to do. It ends a drag when its window loses the focus. When it is hidden or closed, it does so, too: at
-# once, where the end of its connection is seen some 0.1 s later, because the browser ends the thread that has it first. On a phone
-# it folds the sheet of controls, which would cover the organ; viser has no message for that.
+# Ends a drag when the page is hidden or closed. The server would see the closed connection about 0.1 s later: the browser ends the
+# thread that has it first. On a phone, folds the controls, which would cover the organ; viser has no message for that.
 _SCRIPT = """
-if (!window.palpateLetsGo) {
-  window.palpateLetsGo = () => window.dispatchEvent(new Event("blur"));
-  window.addEventListener("pagehide", window.palpateLetsGo);
-  document.addEventListener("visibilitychange", () => { if (document.hidden) window.palpateLetsGo(); });
-  if (window.matchMedia("(max-width: 36em)").matches) {
-    const folding = setInterval(() => {
-      const papers = [...document.querySelectorAll(".mantine-Paper-root")];
-      const sheet = papers.find(e => e.style.position === "fixed" && e.style.bottom === "0px");
-      const handle = sheet?.querySelector('[style*="cursor: pointer"]');
-      if (handle) { clearInterval(folding); handle.click(); }
-    }, 100);
-  }
+if (!window.palpateEndDrag) {
+  window.palpateEndDrag = () => window.dispatchEvent(new Event("blur"));
+  window.addEventListener("pagehide", window.palpateEndDrag);
+  document.addEventListener("visibilitychange", () => { if (document.hidden) window.palpateEndDrag(); });
+  const narrow = window.matchMedia("(max-width: 36em)");
+  const fold = () => {
+    if (!narrow.matches) return;
+    const papers = [...document.querySelectorAll(".mantine-Paper-root")];
+    const sheet = papers.find(e => e.style.position === "fixed" && e.style.bottom === "0px");
+    const handle = sheet?.querySelector('[style*="cursor: pointer"]');
+    if (handle) handle.click(); else setTimeout(fold, 100);
+  };
+  narrow.addEventListener("change", () => setTimeout(fold, 100));
+  fold();
 }
 """
 
@@ -84,14 +86,17 @@ class View:
 
         self.session = Session(self.page, self.panels, connection, connect, self.tell)
         try:
-            self.session.run(stop)
+            with ThreadPoolExecutor(1, "draw", initializer=lower_priority) as drawing:
+                drawing.submit(self.session.run, stop).result()
         finally:
             self.session = None
+            self.panels.show_no_server()
 
-    def tell(self, text: str) -> None:
-        """Show a message on all pages."""
+    def tell(self, text: str, page: int | None = None) -> None:
+        """Show a message on a page, or on all."""
         for client in self.page.get_clients().values():
-            client.add_notification("palpate", text, auto_close_seconds=_TOLD_S)
+            if page in (None, client.client_id):
+                client.add_notification("palpate", text, auto_close_seconds=_TOLD_S)
 
     async def _opened(self, client: viser.ClientHandle) -> None:
         # viser has no public way to this message of its own.
@@ -107,18 +112,17 @@ class View:
         if session := self.session:
             session.choose_tool(self.panels.tool.value)
 
-    def _load(self, _: Any) -> None:
+    def _load(self, event: Any) -> None:
         if session := self.session:
-            session.load(self.panels.model.value, self.panels.stiffness.value)
+            session.load(event.client_id, self.panels.model.value, self.panels.stiffness.value)
 
-    def _record(self, _: Any) -> None:
+    def _record(self, event: Any) -> None:
         if session := self.session:
-            session.record()
+            session.record(event.client_id)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     options = parse_options(arguments)
-    os.nice(NICENESS)  # before any thread begins
     zenoh.init_log_from_env_or("off")
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -129,9 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         connection = connection_for(options)
         with connection:
             view = View(options.host, options.port)
-            url = (
-                f"http://{'127.0.0.1' if options.host == '0.0.0.0' else options.host}:{view.page.get_port()}"
-            )
+            url = page_url(options.host, view.page.get_port())
             print(f"palpate view: {url} shows {connection.keys.prefix}; Ctrl-C stops", flush=True)
             if options.open:
                 webbrowser.open(url)
@@ -155,12 +157,24 @@ def show_again(view: View, options: argparse.Namespace, stop: threading.Event) -
             with connection_for(options) as connection:
                 told = False
                 view.show(options, connection, stop)
-        except (ServerGone, Incompatible) as error:
+        except ClientError as error:
             if not told:
                 view.tell(str(error))
                 print(f"palpate view: {error}; waiting for a server", file=sys.stderr)
                 told = True
             stop.wait(RETRY_S)
+
+
+def lower_priority() -> None:
+    """Let the calling thread wait for the loop, for bridges, and for the thread that commands the tool. On Linux alone it can do so."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+
+
+def page_url(host: str, port: int) -> str:
+    """Where a page that is served from an IP address is found on this machine."""
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def require_host(host: str) -> None:

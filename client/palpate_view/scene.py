@@ -109,7 +109,7 @@ class Scene:
         length_m = _SHAFT * self.size_m
         self._shaft.radius, self._shaft.height = SCENE_PER_M * 0.28 * radius_m, SCENE_PER_M * length_m
         self._shaft.position = in_scene(center_m + 0.5 * length_m * axis)
-        self._shaft.wxyz = rotation_to(axis.round(_DECIMALS))
+        self._shaft.wxyz = np.array(rotation_to(axis)).round(_DECIMALS)
         self._ghost.visible = float(np.linalg.norm(ghost_m - center_m)) > _GHOST_GAP_M
         self._ghost.position = in_scene(ghost_m)
 

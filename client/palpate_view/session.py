@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -12,11 +13,11 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from palpate_client import ClientError, Connection, Geometry, Tool
+from palpate_client import ClientError, Connection, Force, Geometry, Tool
 from palpate_client.wire import RECORDER, Flags
 from palpate_view import motion
 from palpate_view.colors import nice_ceiling
-from palpate_view.frames import ToolState, tool_state
+from palpate_view.frames import tool_state
 from palpate_view.hand import LONGEST_SILENCE_S, Grip, Hand
 from palpate_view.motion import Floats, Gesture
 from palpate_view.panels import DISPLACEMENT, ERROR, GRAB, Panels, legend_html, readout_html, session_html
@@ -32,14 +33,16 @@ _PULSE_TIMEOUT_S = LONGEST_SILENCE_S
 _SMALLEST_SCALE_M = 1e-3
 _SCALE_HALF_LIFE_S = 4.0  # of the colors' largest value, after the tissue has moved less
 _IDENTITY = ("config_sha256", "stiffness_factor")
-_TURNED = 0.02  # rad: a shaft that is so near to its axis is there
+_ALIGNED = 0.02  # rad: below this angle the shaft counts as aligned
+_OPPOSITE = 3.9  # squared distance of two unit vectors; between opposite ones there is no way to turn
 _PATCH_SPHERE = 0.4  # of the patch's radius: of the sphere that is drawn for its tool
 
 
 class Session:
     """Shows the model that a connection's server runs; `run` returns when another model runs there.
 
-    connect(name) makes a connection of another client name to the same server. tell(text) tells the user something.
+    connect(name) makes a connection of another client name to the same server. tell(text, page) tells the user of a page
+    something, or with None all users.
     """
 
     def __init__(
@@ -48,7 +51,7 @@ class Session:
         panels: Panels,
         connection: Connection,
         connect: Callable[[str], Connection],
-        tell: Callable[[str], None],
+        tell: Callable[[str, int | None], None],
     ) -> None:
         description = connection.description
         self._page, self._panels, self._connection = page, panels, connection
@@ -59,7 +62,7 @@ class Session:
         self._watch = Watch(connection, description.tools[0].name)
         self._axis = np.asarray(description.tools[0].normal, float)  # of the tool's shaft
         self._largest_m = _SMALLEST_SCALE_M
-        # How long the page that drags takes to answer. It gets no more frames than it draws, else it would answer later and later.
+        # Round trip of the page that drags, s. Frames are sent no faster, so they do not queue up.
         self._answer_s = 0.0
         page.scene.reset()
         light(page.scene, self._normal())
@@ -68,18 +71,17 @@ class Session:
         self._scene = Scene(page.scene, *surface_at_rest(geometry))
         error = geometry.error_in_band
         self._error = None if error is None else np.frombuffer(error, np.float32)
-        described = description.message["tools"]
+        self._described = {tool["name"]: tool for tool in description.message["tools"]}
         panels.fill(
-            {tool["name"]: tool["radius_m"] for tool in described},
-            described[0]["friction"] if self._anywhere else None,
-            has_error=self._error is not None,
+            list(self._described.values()), anywhere=self._anywhere, has_error=self._error is not None
         )
         panels.fill_models(
             description.message["model_files"],
             description.message["model_file"],
             self._model["stiffness_factor"] if self._anywhere else None,
         )
-        self._loading = threading.Lock()  # held while the connection has to stay
+        self._load_lock = threading.Lock()  # held during a load: `run` must not close the connection
+        self._over = False
         self._hand = Hand(connection, tell)  # its thread is ended by `run`
         self._scene.on_drag(self._on_organ, self._on_tool)
         for client in page.get_clients().values():
@@ -99,14 +101,15 @@ class Session:
                     continue
                 self._watch.begin()
                 with self._page.atomic():
-                    state = self._draw()
-                    if state is not None and time.monotonic() - charts_s > CHART_PERIOD_S:
+                    force = self._draw()
+                    if force is not None and time.monotonic() - charts_s > CHART_PERIOD_S:
                         charts_s = time.monotonic()
-                        self._draw_panels(state)
+                        self._draw_panels(force)
         finally:
+            self._over = True
             self._hand.end()
             self._watch.end()
-            with self._loading:
+            with self._load_lock:
                 pass
 
     # Pages
@@ -124,8 +127,8 @@ class Session:
 
     # What is drawn
 
-    def _draw(self) -> ToolState | None:
-        """One picture; None before the first messages have come."""
+    def _draw(self) -> Force | None:
+        """One picture, of the force that is returned; None before the first messages have come."""
         force, tool, surface = self._watch.force, self._watch.tool_status, self._watch.surface
         if force is None or tool is None or surface is None or len(surface) != len(self._scene.vertices):
             return None
@@ -149,20 +152,19 @@ class Session:
             ghost = state.device_m
         self._scene.draw_tool(center, ghost + (center - state.tip_m), radius_m, self._axis)
         self._scene.draw_contact(points, center, state.force_n)
-        return state
+        return force
 
-    def _draw_panels(self, state: ToolState) -> None:
+    def _draw_panels(self, force: Force) -> None:
         columns = self._watch.history.columns()
-        force, status = self._watch.force, self._connection.status
-        assert force is not None and status is not None
+        status = self._connection.status
+        assert status is not None  # the tool's part of it was drawn
         self._panels.draw_charts(columns)
         words, good = self._words(force.flags)
-        newtons = float(np.linalg.norm(state.force_n))
+        newtons = math.hypot(*force.force_n)
         self._panels.readout.content = readout_html(newtons, force.touch.penetration_m, words, good)
         self._panels.legend.content = self._legend()
         self._panels.session.content = session_html(self._facts(status))
-        recording = status["recording"] is not None
-        self._panels.show_recording(recording)
+        self._panels.show_recording(status["recording"] is not None)
 
     def _colors(self, length: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, float]:
         """What the colors show, (n,), and its largest value; `length` (n,) is that of the displacement, m."""
@@ -191,10 +193,9 @@ class Session:
         holder = (self._watch.tool_status or {}).get("holder")
         if holder is None:
             return "Drag on the organ, or drag the tool", True
-        if flags & (
-            Flags.FAULT | Flags.JUMPED | Flags.FORCE_CLAMPED | Flags.WORKSPACE_CLAMPED | Flags.SPEED_LIMITED
-        ):
-            return _LIMITED[next(flag for flag in _LIMITED if flags & flag)], False
+        for flag, words in _LIMITED.items():
+            if flags & flag:
+                return words, False
         if flags & (Flags.DECAYING | Flags.STALE):
             return "no commands: the force has faded", False
         doing = touch_words(flags) if self._anywhere else "moves its patch"
@@ -227,7 +228,7 @@ class Session:
         """Turn the shaft a little towards the normal of the tissue that is touched; back when nothing is held."""
         wanted = self._normal() if self._hand.normal is None else self._hand.normal
         away = wanted - self._axis
-        if float(np.linalg.norm(away)) < _TURNED:
+        if float(np.linalg.norm(away)) < _ALIGNED or away @ away > _OPPOSITE:
             self._axis = wanted
             return
         axis = self._axis + 0.15 * away
@@ -252,8 +253,11 @@ class Session:
             if gesture is not None:
                 self._take(event.client, gesture)
         elif self._anywhere:
+            grip = self._hand.grip
+            if grip is None or grip.radius_m is None:
+                return
             pointer, hit = _pointer_m(event), self._hit(event)
-            radius_m, depth_m = self._panels.radius_m(), self._depth_m()
+            radius_m, depth_m = grip.radius_m, self._depth_m()
             self._hand.aim(
                 page,
                 lambda g: motion.slid(g, hit, radius_m, depth_m) if g.presses else motion.moved(g, pointer),
@@ -294,13 +298,17 @@ class Session:
             if self._anywhere
             else {}
         )
-        grip = Grip(client.client_id, self._watch.tool, **tip)
-        if not self._hand.take(grip, gesture):
-            self._tell("Another page holds the tool.")
+        page = client.client_id
+        grip = Grip(page, self._watch.tool, **tip)
+        if self._load_lock.locked():
+            self._tell("A model is being loaded.", page)
             return
-        threading.Thread(target=self._feel_pulse, args=(client, grip), name="pulse", daemon=True).start()
+        if not self._hand.take(grip, gesture):
+            self._tell("No server runs now." if self._over else "Another page holds the tool.", page)
+            return
+        threading.Thread(target=self._poll_page, args=(client, grip), name="pulse", daemon=True).start()
 
-    def _feel_pulse(self, client: viser.ClientHandle, grip: Grip) -> None:
+    def _poll_page(self, client: viser.ClientHandle, grip: Grip) -> None:
         """Ask the page that drags for a sign of life, again and again: a page that hangs or sleeps does not answer."""
         while self._hand.grip is grip:
             asked_s = time.monotonic()
@@ -309,9 +317,7 @@ class Session:
             except TimeoutError:
                 self._answer_s = _PULSE_TIMEOUT_S
                 continue
-            except (
-                RuntimeError
-            ):  # the page is gone, which viser tells apart; or it may not store, and has answered
+            except RuntimeError:  # the page is gone, or its browser blocks storage, which is an answer too
                 pass
             self._answer_s = time.monotonic() - asked_s
             self._hand.sign(grip.page)
@@ -335,21 +341,33 @@ class Session:
     def choose_tool(self, name: str) -> None:
         if name in self._tools and name != self._watch.tool:
             self._watch.watch_tool(name)
+            if self._anywhere:
+                self._panels.show_tip(self._described[name])
 
-    def load(self, file: str, stiffness_factor: float) -> None:
-        """Have the server run a model of its folder, that many times as stiff; `run` sees it."""
+    def load(self, page: int | None, file: str, stiffness_factor: float) -> None:
+        """Have the server run a model of its folder, that many times as stiff, for a page; `run` sees it."""
+        if self._hand.grip is not None:
+            self._tell("A page holds the tool: let it go first.", page)
+            return
+        if not self._load_lock.acquire(blocking=False):
+            self._tell("A model is being loaded.", page)
+            return
         try:
-            with self._loading, Tool(self._connection, self._watch.tool):
+            with Tool(self._connection, self._watch.tool):
                 answer = self._connection.control("load", file=file, stiffness_factor=stiffness_factor)
-            factor = answer["model"]["stiffness_factor"]
-            self._tell(
-                f"The server runs {answer['model']['name']}{'' if factor == 1 else f', {factor:g} times as stiff'}."
-            )
         except (ClientError, RuntimeError) as error:
-            self._tell(str(error))
+            self._tell(str(error), page)
+            return
+        finally:
+            self._load_lock.release()
+        factor = answer["model"]["stiffness_factor"]
+        stiff = "" if factor == 1 else f", {factor:g} times as stiff"
+        self._tell(f"The server runs {answer['model']['name']}{stiff}.", None)
+        for warning in answer["warnings"]:
+            self._tell(warning, page)
 
-    def record(self) -> None:
-        """Begin a recording, or end the one that runs, as `palpate record` does and under its name."""
+    def record(self, page: int | None) -> None:
+        """Begin a recording for a page, or end the one that runs, as `palpate record` does and under its name."""
         status = self._connection.status
         running = status is not None and status["recording"] is not None
         file = None if running else time.strftime("view-%Y%m%d-%H%M%S.mcap")
@@ -357,9 +375,9 @@ class Session:
             with self._connect(RECORDER) as recorder:
                 report = recorder.control("record", file=file)["recording"]
             text = f"{report['messages']} messages in {report['file']}" if running else f"Recording to {file}"
-            self._tell(text)
+            self._tell(text, None)
         except ClientError as error:
-            self._tell(str(error))
+            self._tell(str(error), page)
 
 
 _LIMITED = {

@@ -30,6 +30,7 @@ class Watch:
 
     def begin(self) -> None:
         if not self._subscriptions:
+            self.history.forget()
             self._subscriptions = [
                 self._connection.on_force(self._on_force),
                 self._connection.on_surface(self._on_surface),

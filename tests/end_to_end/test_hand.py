@@ -33,7 +33,7 @@ def endpoint(serve_for_module: Callable[..., Any], make_surface_model: Callable[
 def hand_on(endpoint: str) -> Iterator[tuple[Hand, list[str]]]:
     told: list[str] = []
     with Connection(endpoint, "test") as connection:
-        hand = Hand(connection, told.append)
+        hand = Hand(connection, lambda text, page: told.append(text))
         try:
             yield hand, told
         finally:

@@ -201,7 +201,9 @@ def test_the_headless_client_and_the_bridge_run_unchanged(
 
 
 def test_the_headless_client_shows_the_servers_warnings(
-    serve: Callable[..., Any], run_example: Callable[..., Any], make_surface_model: Callable[..., SurfaceModel]
+    serve: Callable[..., Any],
+    run_example: Callable[..., Any],
+    make_surface_model: Callable[..., SurfaceModel],
 ) -> None:
     model = make_surface_model()
     small = replace(model, tools=(replace(model.tools[0], radius_m=0.002),))
