@@ -42,6 +42,7 @@ from palpate_view.surface import Hit, vertex_normals
 FIGURES = ("tick_lateness_s", "compute_time_s")
 DEPTH_M = 0.005  # the page's own
 EVENT_S = 0.05  # between two events of a pointer
+OPENING_S = 6.5  # a page opens so long: as many ticks without a command are in both figures
 FLAGS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing", "--disable-gpu-rasterization", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
@@ -104,6 +105,7 @@ def drag_without(endpoint: str, seconds: float) -> None:
             )
         middle = np.asarray(tool["start_m"], float)
         radius_m: float = tool["radius_m"]
+        time.sleep(OPENING_S)
         end_s, i, taken = time.monotonic() + seconds, 0, hand.grip is not None
         while time.monotonic() < end_s:
             i += 1

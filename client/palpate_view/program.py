@@ -10,14 +10,12 @@ import argparse
 import contextlib
 import io
 import ipaddress
-import os
 import signal
 import socket
 import sys
 import threading
 import webbrowser
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import viser
@@ -31,7 +29,6 @@ from palpate_view.session import Session
 
 DEFAULT_PORT = 8080
 RETRY_S = 1.0
-NICENESS = 10  # of the thread that draws
 _TOLD_S = 6.0
 # Ends a drag when the page is hidden or closed. The server would see the closed connection about 0.1 s later: the browser ends the
 # thread that has it first. On a phone, folds the controls, which would cover the organ; viser has no message for that.
@@ -86,8 +83,7 @@ class View:
 
         self.session = Session(self.page, self.panels, connection, connect, self.tell)
         try:
-            with ThreadPoolExecutor(1, "draw", initializer=lower_priority) as drawing:
-                drawing.submit(self.session.run, stop).result()
+            self.session.run(stop)
         finally:
             self.session = None
             self.panels.show_no_server()
@@ -163,12 +159,6 @@ def show_again(view: View, options: argparse.Namespace, stop: threading.Event) -
                 print(f"palpate view: {error}; waiting for a server", file=sys.stderr)
                 told = True
             stop.wait(RETRY_S)
-
-
-def lower_priority() -> None:
-    """Let the calling thread wait for the loop, for bridges, and for the thread that commands the tool. On Linux alone it can do so."""
-    if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
 
 
 def page_url(host: str, port: int) -> str:
