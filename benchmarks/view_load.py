@@ -4,10 +4,9 @@
 
 Both drag the same tool around the same place at the same rate of commands: without the page a program does, by the same code as
 the page's. The browser (Debian: chromium) draws in software and at a low priority, because it stands for one with a graphics
-processor of its own. Every measurement has a server of its own; they alternate. Without the page,
-busy loops take the browser's place at the lowest priority: a processor of a virtual machine that sleeps wakes up to 2 ms late, and
-the page would seem to make the loop better. Prints p50 and p99 of the server's last status, in
-microseconds, and the ratio.
+processor of its own. Without the page, busy loops take the browser's place at the lowest priority: a processor of a virtual machine
+that sleeps wakes up to 2 ms late, and the page would seem to make the loop better. Every measurement has a server of its own; they
+alternate. Prints p50 and p99 of the server's last status, in microseconds, and the ratio.
 """
 
 from __future__ import annotations

@@ -60,6 +60,10 @@ class Hand:
     def grip(self) -> Grip | None:
         return self._grip
 
+    @property
+    def ended(self) -> bool:
+        return self._ended
+
     def take(self, grip: Grip, gesture: Gesture) -> bool:
         """Hold a tool. False if another page has it, or after `end`."""
         with self._lock:

@@ -81,7 +81,6 @@ class Session:
             self._model["stiffness_factor"] if self._anywhere else None,
         )
         self._load_lock = threading.Lock()  # held during a load: `run` must not close the connection
-        self._over = False
         self._hand = Hand(connection, tell)  # its thread is ended by `run`
         self._scene.on_drag(self._on_organ, self._on_tool)
         for client in page.get_clients().values():
@@ -106,7 +105,6 @@ class Session:
                         charts_s = time.monotonic()
                         self._draw_panels(force)
         finally:
-            self._over = True
             self._hand.end()
             self._watch.end()
             with self._load_lock:
@@ -304,7 +302,7 @@ class Session:
             self._tell("A model is being loaded.", page)
             return
         if not self._hand.take(grip, gesture):
-            self._tell("No server runs now." if self._over else "Another page holds the tool.", page)
+            self._tell("No server runs now." if self._hand.ended else "Another page holds the tool.", page)
             return
         threading.Thread(target=self._poll_page, args=(client, grip), name="pulse", daemon=True).start()
 

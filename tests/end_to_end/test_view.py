@@ -102,22 +102,23 @@ def place_on_the_organ(page: Any) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def drag_until(page: Any, condition: Callable[[], object], what: str) -> None:
-    """Drag around on the organ until something is so; the button stays down.
+def drag_until(page: Any, condition: Callable[[], object], what: str, finger: Finger | None = None) -> None:
+    """Drag around on the organ, with the mouse or a finger, until something is so; it stays down.
 
     It begins anew after N_MOVES: a drag that begins before the camera is at its place may miss the organ, and turns the picture.
     """
+    pointer = finger or page.mouse
     end_s = time.monotonic() + PATIENCE_MS / 1e3
     i = 0
     while not condition():
         assert time.monotonic() < end_s, f"waited for {what}"
         if i % N_MOVES == 0:
-            page.mouse.up()
+            pointer.up()
             x, y = place_on_the_organ(page)
-            page.mouse.move(x, y)
-            page.mouse.down()
+            pointer.move(x, y)
+            pointer.down()
         i += 1
-        page.mouse.move(x + 25 * math.sin(i / 8), y + 12 * math.sin(i / 5))
+        pointer.move(x + 25 * math.sin(i / 8), y + 12 * math.sin(i / 5))
 
 
 def hold_still(page: Any, client: Any) -> None:
@@ -147,27 +148,30 @@ def close(page: Any) -> tuple[int, int]:
 
 
 class Finger:
-    """Drags on the organ, as `drag_until`."""
+    """A finger on a page, with the methods of its mouse."""
 
     def __init__(self, page: Any) -> None:
-        self._page, self._session, self._moves = page, page.context.new_cdp_session(page), 0
+        self._session = page.context.new_cdp_session(page)
+        self._place: dict[str, float] = {}
+        self._is_down = False
 
-    def move(self) -> None:
-        if self._moves % N_MOVES == 0:
-            if self._moves:
-                self.lift()
-            self._x, self._y = place_on_the_organ(self._page)
-            self._send("touchStart", self._x)
-        self._moves += 1
-        self._send("touchMove", self._x + 20 * math.sin(self._moves / 8))
-        time.sleep(EVENT_S)
+    def move(self, x: float, y: float) -> None:
+        self._place = {"x": x, "y": y}
+        if self._is_down:
+            self._send("touchMove", self._place)
+            time.sleep(EVENT_S)
 
-    def lift(self) -> None:
-        self._send("touchEnd")
+    def down(self) -> None:
+        self._is_down = True
+        self._send("touchStart", self._place)
 
-    def _send(self, kind: str, *x: float) -> None:
-        points = [{"x": at, "y": self._y} for at in x]
-        self._session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    def up(self) -> None:
+        if self._is_down:
+            self._is_down = False
+            self._send("touchEnd")
+
+    def _send(self, kind: str, *places: dict[str, float]) -> None:
+        self._session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": places})
 
 
 def colored_pixels(picture: Path) -> int:
@@ -344,12 +348,9 @@ def test_the_page_fits_a_phone_and_a_finger_presses(
         assert wide <= 0  # nothing to scroll sideways
         page.get_by_text("Press, mm").wait_for(state="hidden")  # the controls are folded
         finger = Finger(page)
-        end_s = time.monotonic() + PATIENCE_MS / 1e3
-        while newtons(client.forces[-1]) < 0.15:
-            assert time.monotonic() < end_s, "waited for a force"
-            finger.move()
+        drag_until(page, lambda: newtons(client.forces[-1]) > 0.15, "a force", finger)
         page.screenshot(path=PICTURES / "phone.png")
-        finger.lift()
+        finger.up()
         client.status_when(lambda status: status["tools"]["tip"]["holder"] is None, "a free tool")
         page.close()
 

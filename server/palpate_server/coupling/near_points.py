@@ -24,7 +24,8 @@ class TooManyPoints(ValueError):
 def near_points(points: Floats, triangles: NDArray[np.int32], reach_m: float, most: int) -> Integers:
     """(n_points, k), k <= most: for each point those within reach_m, nearest first, itself included; NONE beyond them.
 
-    Points that an edge connects with it are always near it. Another point counts only if edges within the reach connect it to the first, so that the far side of a thin lobe does not.
+    Points that an edge connects with it are always near it. Another point counts only if edges within the reach connect it to the
+    first, so that the far side of a thin lobe does not.
     Raises TooManyPoints where there are more than `most`.
     """
     starts, neighbors = _adjacency(len(points), triangles)
