@@ -405,7 +405,14 @@ def test_the_motors_are_left_without_a_force_at_the_end(
         raise AssertionError("no force at the end of any of 5 pokes")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGINT,
+        signal.SIGTERM,
+        *(pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGQUIT, signal.SIGHUP)),
+    ],
+)
 def test_the_motors_are_left_without_a_force_by_a_signal(
     serve: Callable[..., Any], run_bridge_until_a_force: Callable[..., Bridge], number: int
 ) -> None:

@@ -187,6 +187,7 @@ def equilibrium(
     return force
 
 
+@pytest.mark.slow
 def test_a_tip_on_an_ellipsoid_feels_what_finite_elements_say(tmp_path: Path) -> None:
     radius = 0.012
     model = built(tmp_path, TOP, radius, 0.010, fine=0.002, spacing=0.006)

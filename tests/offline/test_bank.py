@@ -37,7 +37,7 @@ def check(family, tmp_path, executor):
     assert stiffness == pytest.approx([stiffness[0] * factor for factor in (1, 5 / 4, 6 / 4)], rel=1e-9)
 
 
-@pytest.mark.parametrize("executor", ["threads", "processes"])
+@pytest.mark.parametrize("executor", ["threads", pytest.param("processes", marks=pytest.mark.slow)])
 def test_a_family_is_built_with_its_shared_stages_once(family, tmp_path, executor):
     check(family, tmp_path, executor)
 

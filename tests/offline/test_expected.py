@@ -32,7 +32,7 @@ def liver(spacing_m):
     return check_config(tables, "liver"), FOLDER
 
 
-@pytest.mark.parametrize("spacing_m", [0.012, 0.008])
+@pytest.mark.parametrize("spacing_m", [0.012, pytest.param(0.008, marks=pytest.mark.slow)])
 def test_the_expected_number_of_nodes_of_the_liver_is_right_to_a_tenth(spacing_m):
     config, folder = liver(spacing_m)
     assert expected_size(config, folder).n_nodes == pytest.approx(

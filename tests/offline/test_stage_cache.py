@@ -161,8 +161,21 @@ build_model(config, Path(), Killed(), StageCache.open(Path(sys.argv[2])))
 STAGES = {"assembly": {"cloud"}, "modes": {"cloud", "body"}, "reduction": {"cloud", "body", "modes"}}
 
 
-@pytest.mark.parametrize("all_modes_up_to", [2000, 0], ids=["all modes", "Ritz modes"])
-@pytest.mark.parametrize("killed_in", list(STAGES))
+def killed(stage, modes, *marks):
+    return pytest.param(stage, {"all": 2000, "Ritz": 0}[modes], id=f"{stage}-{modes}", marks=marks)
+
+
+@pytest.mark.parametrize(
+    ("killed_in", "all_modes_up_to"),
+    [
+        killed("assembly", "all"),
+        killed("modes", "Ritz"),
+        killed("reduction", "Ritz"),
+        killed("assembly", "Ritz", pytest.mark.slow),
+        killed("modes", "all", pytest.mark.slow),
+        killed("reduction", "all", pytest.mark.slow),
+    ],
+)
 def test_a_build_that_is_killed_goes_on_and_gives_the_same_file(
     slab_scene, tmp_path, monkeypatch, killed_in, all_modes_up_to
 ):

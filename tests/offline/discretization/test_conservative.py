@@ -165,7 +165,7 @@ def test_stiffness_is_symmetric_and_semi_definite_with_six_rigid_motions(cloud):
     assert np.sum(eigenvalues < 100 * round_off) == 6
 
 
-@pytest.mark.parametrize("jitter", [0.0, 0.2])
+@pytest.mark.parametrize("jitter", [pytest.param(0.0, marks=pytest.mark.slow), 0.2])
 def test_cube_frequencies_are_within_two_and_a_half_percent_at_nine_nodes_an_edge_and_improve_with_refinement(
     jitter,
 ):

@@ -163,7 +163,7 @@ def check_all_scenes(model: SurfaceModel, n: int, seed: int) -> None:
 
 
 def test_no_motion_gets_energy_out(soft_and_stiff: SurfaceModel) -> None:
-    check_all_scenes(soft_and_stiff, 2_500, seed=1)
+    check_all_scenes(soft_and_stiff, 1_200, seed=1)
 
 
 @pytest.mark.slow
