@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,15 @@ _STOPS = (
     (0.85, (255, 226, 110)),
     (1.0, (255, 250, 215)),
 )
+
+
+@dataclass(frozen=True)
+class Coloring:
+    """What the colors show: its name, its values (n,) at the vertices, and the value of the last color."""
+
+    name: str
+    values: NDArray[np.floating]
+    largest: float
 
 
 def color_at(share: float) -> Rgb:

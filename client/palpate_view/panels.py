@@ -15,7 +15,8 @@ from palpate_view import colors
 from palpate_view.history import SHOWN_S
 
 PRESS, GRAB = "Press and slide", "Hold and pull"
-DISPLACEMENT, ERROR, NO_COLOR = "Displacement", "Error of the model in its band", "None"
+DISPLACEMENT, STRAIN, NO_COLOR = "Displacement", "Strain of the surface", "None"
+ERROR = "Error of the model in its band"
 RECORD, STOP = "Record", "Stop recording"
 
 _AXIS = "#8a919c"
@@ -106,7 +107,7 @@ class Panels:
             self.radius = gui.add_slider("Radius, mm", 0.5, 10.0, 0.1, 5.0, visible=False)
             self.friction = gui.add_slider("Friction", 0.0, 2.0, 0.05, 0.3, visible=False)
         with gui.add_folder("Colors"):
-            self.color = gui.add_dropdown("Show", (DISPLACEMENT, NO_COLOR))
+            self.color = gui.add_dropdown("Show", (DISPLACEMENT, STRAIN, NO_COLOR))
             self.legend = gui.add_html("")
         with gui.add_folder("Session"):
             self.model = gui.add_dropdown("Model", ("-",), hint="Of the server's folder of models")
@@ -143,7 +144,7 @@ class Panels:
 
     def fill(self, tools: Sequence[Mapping[str, Any]], *, anywhere: bool, has_error: bool) -> None:
         """Show what a model's tools can be asked for: `name`, `radius_m` and `friction` of each, as the server describes it."""
-        self.color.options = (DISPLACEMENT, ERROR, NO_COLOR) if has_error else (DISPLACEMENT, NO_COLOR)
+        self.color.options = (DISPLACEMENT, STRAIN, *((ERROR,) if has_error else ()), NO_COLOR)
         self.tool.options = tuple(tool["name"] for tool in tools)
         _set(self.tool, tools[0]["name"])
         self.tool.visible = len(tools) > 1

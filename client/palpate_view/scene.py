@@ -71,7 +71,7 @@ class Scene:
             node.visible = False
         self.shown_m = vertices  # (n, 3), m: where the vertices are seen
         self._drawn = np.full_like(vertices, np.nan, np.float32)  # the displacement that is seen
-        self._drawn_scale: tuple[bool, float] | None = None
+        self._drawn_scale: tuple[str, float] | None = None
 
     def on_drag(self, organ: Drag, tool: Drag) -> None:
         """Call organ(event) and tool(event) for each of viser's drag events on them."""
@@ -79,24 +79,23 @@ class Scene:
         for node in (self._tool, self._shaft):
             node.on_drag("left")(tool)
 
-    def draw_organ(
-        self, displacement: NDArray[np.float32], values: NDArray[np.float32] | None, largest: float
-    ) -> None:
-        """The organ with a displacement (n, 3), m; colors for `values` (n,) from 0 to `largest`, or none.
+    def draw_organ(self, displacement: NDArray[np.float32], coloring: colors.Coloring | None) -> None:
+        """The organ with a displacement (n, 3), m, and colors on it, or none.
 
         Nothing is sent while nothing is seen to move.
         """
-        scale = (values is not None, largest)
+        scale = None if coloring is None else (coloring.name, coloring.largest)
         if scale == self._drawn_scale and np.abs(displacement - self._drawn).max() < _STILL_M:
             return
         self._drawn, self._drawn_scale = displacement.copy(), scale
         self.shown_m = self.vertices + displacement
         self._organ.vertices = (SCENE_PER_M * self.shown_m).astype(np.float32)
-        if values is None:
+        if coloring is None:
             for node in self._bands:
                 node.visible = False
             return
-        found = bands(self.shown_m + self._lift, self.triangles, values, colors.band_levels(largest))
+        levels = colors.band_levels(coloring.largest)
+        found = bands(self.shown_m + self._lift, self.triangles, coloring.values, levels)
         for node, (points, faces) in zip(self._bands, found, strict=True):
             if len(faces):
                 node.vertices, node.faces = SCENE_PER_M * points, faces

@@ -16,12 +16,22 @@ from numpy.typing import NDArray
 from palpate_client import ClientError, Connection, Force, Geometry, Tool
 from palpate_client.wire import RECORDER, Flags
 from palpate_view import motion
-from palpate_view.colors import nice_ceiling
+from palpate_view.colors import Coloring, nice_ceiling
 from palpate_view.frames import tool_state
 from palpate_view.hand import LONGEST_SILENCE_S, Grip, Hand
 from palpate_view.motion import Floats, Gesture
-from palpate_view.panels import DISPLACEMENT, ERROR, GRAB, Panels, legend_html, readout_html, session_html
+from palpate_view.panels import (
+    DISPLACEMENT,
+    ERROR,
+    GRAB,
+    STRAIN,
+    Panels,
+    legend_html,
+    readout_html,
+    session_html,
+)
 from palpate_view.scene import SCENE_PER_M, Scene, background, camera_position, light
+from palpate_view.strain import SurfaceStrain
 from palpate_view.surface import Hit, Triangles, ray_hit, touched_points
 from palpate_view.watch import Watch
 
@@ -31,6 +41,7 @@ CHART_PERIOD_S = 0.2
 PULSE_S = 0.1  # pause between two questions to the page that drags
 _PULSE_TIMEOUT_S = LONGEST_SILENCE_S
 _SMALLEST_SCALE_M = 1e-3
+_SMALLEST_STRAIN = 0.02
 _SCALE_HALF_LIFE_S = 4.0  # of the colors' largest value, after the tissue has moved less
 _IDENTITY = ("config_sha256", "stiffness_factor")
 _ALIGNED = 0.02  # rad: below this angle the shaft counts as aligned
@@ -61,7 +72,10 @@ class Session:
         self._anywhere = self._model.get("kind") == "surface"
         self._watch = Watch(connection, description.tools[0].name)
         self._axis = np.asarray(description.tools[0].normal, float)  # of the tool's shaft
-        self._largest_m = _SMALLEST_SCALE_M
+        self._largest: dict[
+            str, float
+        ] = {}  # value that was drawn last, fading, by the name of what is shown
+        self._coloring: Coloring | None = None
         # Round trip of the page that drags, s. Frames are sent no faster, so they do not queue up.
         self._answer_s = 0.0
         page.scene.reset()
@@ -69,6 +83,7 @@ class Session:
         page.scene.set_background_image(background(), "png")
         geometry = connection.geometry()
         self._scene = Scene(page.scene, *surface_at_rest(geometry))
+        self._strain = SurfaceStrain(self._scene.vertices, self._scene.triangles)
         error = geometry.error_in_band
         self._error = None if error is None else np.frombuffer(error, np.float32)
         self._described = {tool["name"]: tool for tool in description.message["tools"]}
@@ -131,11 +146,8 @@ class Session:
         if force is None or tool is None or surface is None or len(surface) != len(self._scene.vertices):
             return None
         state = tool_state(force, tool)
-        length = np.linalg.norm(surface, axis=1)
-        fading = 0.5 ** (FRAME_PERIOD_S / _SCALE_HALF_LIFE_S)
-        self._largest_m = max(float(length.max()), self._largest_m * fading, _SMALLEST_SCALE_M)
-        values, largest = self._colors(length)
-        self._scene.draw_organ(surface, values, largest)
+        self._coloring = self._color(surface)
+        self._scene.draw_organ(surface, self._coloring)
         self._turn_axis()
         radius_m = self._radius_m(tool)
         if self._anywhere:
@@ -164,27 +176,32 @@ class Session:
         self._panels.session.content = session_html(self._facts(status))
         self._panels.show_recording(status["recording"] is not None)
 
-    def _colors(self, length: NDArray[np.float32]) -> tuple[NDArray[np.float32] | None, float]:
-        """What the colors show, (n,), and its largest value; `length` (n,) is that of the displacement, m."""
+    def _color(self, surface: NDArray[np.float32]) -> Coloring | None:
+        """What the colors show of a displacement (n, 3), m."""
         shown = self._panels.color.value
-        if shown == DISPLACEMENT:
-            return length, nice_ceiling(self._largest_m)
         if shown == ERROR and self._error is not None:
-            return self._error, self._largest_error()
-        return None, 1.0
+            # Supports, where the error is largest by far, would leave no colors for the rest.
+            nearly_largest = max(float(np.quantile(self._error, 0.95)), 1e-4)
+            return Coloring(shown, self._error, nice_ceiling(nearly_largest))
+        if shown == DISPLACEMENT:
+            values = np.linalg.norm(surface, axis=1)
+            largest = max(float(values.max()), _SMALLEST_SCALE_M)
+        elif shown == STRAIN:
+            # It is largest by far below the tool, where it is not seen.
+            values = self._strain.largest(self._scene.vertices + surface)
+            largest = max(float(np.quantile(values, 0.99)), _SMALLEST_STRAIN)
+        else:
+            return None
+        fading = 0.5 ** (FRAME_PERIOD_S / _SCALE_HALF_LIFE_S)
+        self._largest[shown] = largest = max(largest, self._largest.get(shown, 0.0) * fading)
+        return Coloring(shown, values, nice_ceiling(largest))
 
     def _legend(self) -> str:
-        shown = self._panels.color.value
-        if shown == DISPLACEMENT:
-            return legend_html(f"{1e3 * nice_ceiling(self._largest_m):g} mm")
-        if shown == ERROR and self._error is not None:
-            return legend_html(f"{100 * self._largest_error():g} % and more")
-        return ""
-
-    def _largest_error(self) -> float:
-        """Nearly the largest of the map: supports, where it is largest by far, leave no colors for the rest."""
-        assert self._error is not None
-        return nice_ceiling(max(float(np.quantile(self._error, 0.95)), 1e-4))
+        if self._coloring is None:
+            return ""
+        if self._coloring.name == DISPLACEMENT:
+            return legend_html(f"{1e3 * self._coloring.largest:g} mm")
+        return legend_html(f"{100 * self._coloring.largest:g} % and more")
 
     def _words(self, flags: int) -> tuple[str, bool]:
         """What the tool does, in a few words, and whether all is well."""

@@ -107,7 +107,7 @@ def split(
 
 
 def bands(
-    vertices: Floats, triangles: Triangles, values: Floats | NDArray[np.float32], levels: Floats
+    vertices: Floats, triangles: Triangles, values: NDArray[np.floating], levels: Floats
 ) -> list[tuple[NDArray[np.float32], NDArray[np.uint32]]]:
     """The parts of a surface between one level and the next, as (vertices (k, 3), triangles (j, 3)); the last one has no end.
 

@@ -23,6 +23,7 @@ from scipy import ndimage
 from palpate.model_file import SurfaceModel, save_model
 from palpate_client.local_server import free_endpoint
 from palpate_client.wire import Flags
+from palpate_view.panels import STRAIN
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 Image = pytest.importorskip("PIL.Image")
@@ -228,6 +229,26 @@ def test_a_drag_on_the_organ_presses_and_the_closed_page_lets_go(
     for what, times in (("was told that it ends", took_s), ("was to be closed", asked_s)):
         print(f"no force {sorted(round(1e3 * t) for t in times)} ms after the page {what}")
     assert statistics.median(took_s) < CLOSED_S, took_s
+
+
+def test_the_colors_can_show_the_strain(
+    browser: Any,
+    serve: Callable[..., Any],
+    view: Callable[[str], str],
+    connect: Callable[..., Any],
+    make_surface_model: Callable[..., SurfaceModel],
+) -> None:
+    served = serve(model=make_surface_model())
+    address = view(served.endpoint)
+    with connect(served.endpoint) as client:
+        page = opened(browser, address)
+        page.get_by_role("combobox", name="Show").click()
+        page.get_by_role("option", name=STRAIN).click()
+        page.get_by_text("2 % and more", exact=True).wait_for()  # the smallest scale
+        drag_until(page, lambda: newtons(client.forces[-1]) > 0.15, "a force")
+        drag_until(page, lambda: newtons_shown(page) > 0.1, "the force on the page")
+        page.screenshot(path=PICTURES / "surface_strained.png")
+        assert colored_pixels(PICTURES / "surface_strained.png") > N_COLORED
 
 
 def renderers() -> list[psutil.Process]:
