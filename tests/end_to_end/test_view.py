@@ -95,12 +95,15 @@ def pixels(page: Any) -> np.ndarray:
 
 
 def place_on_the_organ(page: Any) -> tuple[float, float]:
-    """The place that is farthest inside of what has the tissue's colors."""
-    r, g, b = np.moveaxis(pixels(page), 2, 0)
-    inside = ndimage.distance_transform_edt((r > 80) & (r > 1.2 * g) & (r > 1.4 * b))
-    y, x = np.unravel_index(int(inside.argmax()), inside.shape)
-    assert inside[y, x] > 25, "no organ is seen"
-    return float(x), float(y)
+    """The place that is farthest inside of what has the tissue's colors, once that is seen: a picture may not be drawn yet."""
+    end_s = time.monotonic() + PATIENCE_MS / 1e3
+    while True:
+        r, g, b = np.moveaxis(pixels(page), 2, 0)
+        inside = ndimage.distance_transform_edt((r > 80) & (r > 1.2 * g) & (r > 1.4 * b))
+        y, x = np.unravel_index(int(inside.argmax()), inside.shape)
+        if inside[y, x] > 25:
+            return float(x), float(y)
+        assert time.monotonic() < end_s, "no organ is seen"
 
 
 def drag_until(page: Any, condition: Callable[[], object], what: str, finger: Finger | None = None) -> None:
