@@ -137,7 +137,8 @@ def expectation_text(config: Config, folder: Path) -> str:
     lines += [
         f"{'all':28} {sum(s.seconds for s in stages):8.0f} {most / 2**30:9.1f}",
         "",
-        f"Processor seconds of a core of 2.5 GHz; two cores, when quiet, take somewhat more than half. This machine has {machine_memory() / 2**30:.1f} GiB"
+        f"Processor seconds of a core of 2.5 GHz; two cores, when quiet, take somewhat more than half. "
+        f"The first build also compiles, for some 40 s. This machine has {machine_memory() / 2**30:.1f} GiB"
         + ("." if most <= machine_memory() else ": too little, use a coarser cloud."),
     ]
     return "\n".join(lines)
