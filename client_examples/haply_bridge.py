@@ -37,6 +37,7 @@ class Inverse3:
 
     profile = "inverse3"
     damping_n_s_per_m = None
+    reads_at_render = True  # the service answers a force with the state of that moment
     right, outward = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 
     def __init__(self, url):

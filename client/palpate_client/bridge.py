@@ -11,6 +11,7 @@ import contextlib
 import math
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
@@ -38,6 +39,9 @@ class Device(Protocol):
     damping_n_s_per_m: the device's own; None if unknown.
     right, outward: unit vectors, at right angles: to the right of the person, and out of the tissue (up, for most devices).
     neutral_m: where the device stands when the tip touches the tissue without pressing.
+
+    A device may have `reads_at_render = True`: `read` then tells where it was when `render` was called last. Its forces are
+    rendered as soon as they come, not at the next step, and one force still acts between two positions.
     """
 
     profile: str
@@ -133,14 +137,28 @@ def _interrupt(*_: object) -> None:
 
 def _drive(device: Device, tool: Tool, description: Description, duration_s: float) -> None:
     contact = OneSidedContact(tool, description.hold_s)
+    reads_at_render = getattr(device, "reads_at_render", False)
     touches = False
+
+    def render() -> None:
+        force_n = tool.take_force()  # along the device's axes already, and with its sign
+        device.render(force_n if touches else NO_FORCE)
+
     try:
-        for _ in steps(duration_s, description.period_s):
-            force_n = tool.take_force()  # along the device's axes already, and with its sign
-            device.render(force_n if touches else NO_FORCE)
+        if reads_at_render:
+            device.render(NO_FORCE)
+        start_s = math.inf
+        for i in steps(duration_s, description.period_s):
+            start_s = min(start_s, time.monotonic())
+            if not reads_at_render:
+                render()
             position_m, velocity_m_per_s = device.read()
             tip_m, touches = contact.tip(position_m)
             tool.move(tip_m, velocity_m_per_s if touches else NO_FORCE)
+            if reads_at_render:
+                left_s = start_s + (i + 1) * description.period_s - time.monotonic()
+                tool.wait_for_answer(max(left_s, 0.0))  # steps that are late don't wait: they catch up
+                render()
     finally:
         with contextlib.suppress(DeviceLost):
             device.render(NO_FORCE)  # or the motors would keep the last force, however this ends

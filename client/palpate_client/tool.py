@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -72,6 +73,8 @@ class Tool:
         self._rendered_tick: int | None = None
         self._attached = False
         self._forces: Subscription = None
+        self._sent = 0  # sequence of the newest command
+        self._answered = threading.Event()  # that a force has come which knows of it
 
     def __enter__(self) -> Tool:
         """Raises Refused, ServerGone or Incompatible, and RuntimeError inside of another `with` statement of the connection's tools."""
@@ -123,7 +126,11 @@ class Tool:
             velocity = {self.name: _vector("velocity_m_per_s", velocity_m_per_s)}
         position = {self.name: _vector("position_m", position_m)}
         attach = {self.name: True} if self._attached else None
-        self._connection.send(position, velocity, self._rendered_tick, attach, self.contract.on_sending)
+        self._connection.send(position, velocity, self._rendered_tick, attach, self._on_sending)
+
+    def wait_for_answer(self, timeout_s: float) -> bool:
+        """Wait until a force has come that knows of the last `move`; False when none comes in time. For one thread at a time."""
+        return self._answered.wait(timeout_s)
 
     def attach(self) -> None:
         """Hold the tissue under the tip from the next `move` on, as soon as it touches: it can be pulled then.
@@ -202,10 +209,17 @@ class Tool:
         self.normal = self.frame.direction_at_client(described.normal)
         self.touches_anywhere = description.message["model"].get("kind") == "surface"
 
+    def _on_sending(self, sequence: int, client_time_ns: int) -> None:
+        self._answered.clear()
+        self._sent = sequence
+        self.contract.on_sending(sequence, client_time_ns)
+
     def _on_force(self, force: Force) -> None:
         if self.contract.on_force(force):  # a force that breaks the contract is as good as none
             self._since_s = force.arrival_ns * 1e-9
             self.newest = force
+            if force.sequence >= self._sent:
+                self._answered.set()
 
 
 def _vector(name: str, value: Sequence[float]) -> list[float]:

@@ -98,6 +98,18 @@ def test_a_tool_is_held_from_entering_to_leaving_and_its_force_points_out_of_the
         assert tool.take_force() == (0.0, 0.0, 0.0)
 
 
+def test_the_force_that_knows_of_a_command_is_waited_for(connection: Connection) -> None:
+    with Tool(connection) as tool:
+        assert not tool.wait_for_answer(0.0)  # nothing was sent
+        answered = []
+        for _ in range(20):
+            tool.move(tool.home_m)
+            assert tool.wait_for_answer(60.0)
+            assert tool.newest is not None
+            answered.append(tool.newest.sequence)
+    assert answered == list(range(answered[0], answered[0] + 20))
+
+
 def test_what_is_no_position_is_told_at_once(connection: Connection) -> None:
     with Tool(connection) as tool:
         for wrong in (
