@@ -57,14 +57,22 @@ def main() -> int:
     if "--debug" in arguments:
         arguments.remove("--debug")
         os.environ["PALPATE_DEBUG"] = "1"  # also for the programs that a command starts
+    try:
+        return _command(arguments)
+    except BrokenPipeError:  # the reader of our output, such as `head`, has ended
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at exit
+        return 128 + signal.SIGPIPE
+
+
+def _command(arguments: list[str]) -> int:
     name = arguments[0] if arguments else "--help"
     if name in ("--help", "-h"):
-        print(_help())
+        print(_help(), flush=True)
         return 0
-    if name == "--version":
+    if "--version" in arguments and set(arguments) <= {"--version", "--json"}:
         from palpate.versions import versions_text
 
-        print(versions_text(as_json="--json" in arguments))
+        print(versions_text(as_json="--json" in arguments), flush=True)
         return 0
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, 1)
@@ -89,9 +97,8 @@ def _run(name: str, command: Command) -> int:
             raise
         extra = f"palpate[{command.extra}]" if command.extra else "palpate"
         return _fail(f"{name} needs the package {package}, which is not installed: pip install '{extra}'")
-    except BrokenPipeError:  # the reader of our output, such as `head`, has had enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at exit
-        return 128 + signal.SIGPIPE
+    except BrokenPipeError:
+        raise
     except (ValueError, OSError, MemoryError) as error:
         if os.environ.get("PALPATE_DEBUG"):
             raise

@@ -237,7 +237,7 @@ def _make_ply(
 
 
 def fit() -> None:
-    """Fit the material of a scene to measured records of a tissue, and say what they don't tell."""
+    """Fit the material of a scene to measured records of a tissue, and say what they don't determine."""
     parser = argparse.ArgumentParser(
         description=fit.__doc__,
         epilog="Columns: time_s, strain, stress_pa; or time_s, displacement_m, force_n; or frequency_hz, storage_pa, loss_pa.",
@@ -275,7 +275,7 @@ def fit() -> None:
     try:
         tissue = fit_tissue([read_record(path, specimen) for path in options.records], options.partial)
     except NotIdentifiable as error:
-        raise NotIdentifiable(f"{error}\n--partial gives what can be told all the same") from error
+        raise NotIdentifiable(f"{error}\n--partial gives what the records determine") from error
     if options.picture:
         draw_tissue(tissue, options.picture)
     if options.json:

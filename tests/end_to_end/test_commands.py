@@ -89,13 +89,14 @@ def interrupted(_: Any) -> int:
     return code
 
 
-def unread(_: Any) -> int:
+def unread(_: Any, *arguments: str) -> int:
     reading, writing = os.pipe()
     os.close(reading)
+    command = [sys.executable, "-m", "palpate", *(arguments or ("tissues",))]
     try:
-        return subprocess.run(
-            [sys.executable, "-m", "palpate", "tissues"], stdout=writing, timeout=60
-        ).returncode
+        ended = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, timeout=60)
+        assert not ended.stderr
+        return ended.returncode
     finally:
         os.close(writing)
 
@@ -255,6 +256,15 @@ def test_a_mistyped_command_gets_the_nearest_one(run: Callable[..., Any]) -> Non
     code, _, err = run("chek-host")
     assert code == 2
     assert err.endswith("did you mean 'check-host'?\n")
+
+
+@pytest.mark.parametrize("option", ["--version", "--help"])
+def test_no_reader_of_the_output_is_no_error(option: str) -> None:
+    assert unread(None, option) == 141
+
+
+def test_the_order_of_version_and_json_does_not_matter(run: Callable[..., Any]) -> None:
+    assert run("--json", "--version") == run("--version", "--json")
 
 
 def test_the_version_has_a_line_for_all_that_matters(run: Callable[..., Any]) -> None:

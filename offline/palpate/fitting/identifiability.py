@@ -1,4 +1,4 @@
-"""What the records don't tell of a material, and which data would."""
+"""what the records don't determine of a material, and which data would."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def _too_fast(record: Record, time: Interval | None) -> str:
     needed = time.value if time and is_told else 0.1 * shortest
     if isinstance(record, TimeRecord):
         return (
-            f"a ramp of {record.ramp_s:.3g} s tells no time constant below {shortest:.3g} s, and the tissue relaxes faster "
+            f"a ramp of {record.ramp_s:.3g} s does not determine a time constant below {shortest:.3g} s, and the tissue relaxes faster "
             f"than that, too ({constant}). Missing: a ramp of at most {_about(needed)} s, or the complex modulus up to "
             f"{_hz(needed)} Hz"
         )
@@ -89,7 +89,7 @@ def _too_slow(record: Record, time: Interval | None) -> str:
     needed = 3 * time.value if time and is_told else 20 * longest
     if isinstance(record, TimeRecord):
         return (
-            f"a hold of {record.hold_s:.3g} s tells no time constant above {longest:.3g} s, half of it, and the tissue still "
+            f"a hold of {record.hold_s:.3g} s does not determine a time constant above {longest:.3g} s, half of it, and the tissue still "
             f"relaxes at its end ({constant}): its stiffness at rest isn't known. Missing: a hold of at least {_about(needed)} s"
         )
     return (

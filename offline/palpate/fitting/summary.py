@@ -95,7 +95,7 @@ def _misfit_words(tissue: Tissue) -> str:
 
 def _told(tissue: Tissue) -> str:
     windows = " and ".join(_window(record) for record in tissue.records)
-    return f"Time constants outside {windows} are not told."
+    return f"Time constants outside {windows} are not determined."
 
 
 def _window(record: Record) -> str:

@@ -31,7 +31,7 @@ _SIGNIFICANT = 2.58  # standard deviations: by chance in 1 of 200
 
 
 class NotIdentifiable(ValueError):
-    """The records don't tell a part of the material: a line for each, with the data that are missing."""
+    """the records don't determine a part of the material: a line for each, with the data that are missing."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Tissue:
     loss_tangent  in the haptic band
     residuals     for each record, (n_rows,), fit minus record: over time relative to the largest value; over frequency
                   relative to |E*|, first of the storage, then of the loss modulus
-    missing       what the records don't tell, and which data would: a sentence each
+    missing       what the records don't determine, and which data would: a sentence each
     notes         what was assumed or is unusual: a sentence each
     """
 
@@ -87,7 +87,7 @@ class Tissue:
 def fit_tissue(records: Sequence[Record], partial: bool = False) -> Tissue:
     """Fit one material to all records.
 
-    partial  give the material also where the records don't tell a part of it; `missing` says which
+    partial  give the material also where the records don't determine a part of it; `missing` says which
 
     Raises NotIdentifiable, or ValueError for records that can't be fitted together.
     """
